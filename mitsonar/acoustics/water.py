@@ -385,14 +385,32 @@ def delay_iterated(
     return delay
 
 
-def delay_exact(to_point: Vector, from_receiver: Vector, velocity: Vector, sound_speed: float) -> AnyArray:
+def delay_exact(
+    to_point: Vector, from_receiver: Vector, velocity: Vector, sound_speed: float, point_velocity: Vector | None = None
+) -> AnyArray:
     """Return the exact delay to a receiver that moves while sound travels [s]: the limit of :func:`delay_iterated`.
 
     |P - B - v tau| = c (tau - tau_0) is a quadratic equation, whose larger root is the one after tau_0. Let s = tau - tau_0,
     and let q be the vector from the receiver to P when the sound is at P. Then (c^2 - v^2) s^2 + 2 q.v s - q^2 = 0. This
-    form suffers no cancellation.
+    form suffers no cancellation. The way to a point that moves with velocity u is such an equation with v = -u.
+
+    Args:
+        to_point: vectors from the transmitter to the points as the sound is sent [m].
+        from_receiver: vectors from the receiver to the points at that time [m].
+        velocity: of the receiver [m/s].
+        sound_speed: [m/s].
+        point_velocity: of the points [m/s]; default: at rest.
     """
-    out = length(to_point) / sound_speed
-    left = [q - v * out for q, v in zip(from_receiver, velocity, strict=True)]
-    closing, speed2 = dot(left, velocity), sound_speed**2 - dot(velocity, velocity)
-    return out + ((closing * closing + speed2 * dot(left, left)) ** 0.5 - closing) / speed2
+    if point_velocity is None:
+        out, relative = length(to_point) / sound_speed, [-v for v in velocity]
+    else:
+        out = _meeting(to_point, point_velocity, sound_speed)
+        relative = [u - v for u, v in zip(point_velocity, velocity, strict=True)]
+    left = [q + w * out for q, w in zip(from_receiver, relative, strict=True)]
+    return out + _meeting(left, [-v for v in velocity], sound_speed)
+
+
+def _meeting(apart: Vector, velocity: Vector, sound_speed: float) -> AnyArray:
+    """Return the time [s] after which sound meets what is ``apart`` [m] from its source and moves with a velocity [m/s]."""
+    leaving, speed2 = dot(apart, velocity), sound_speed**2 - dot(velocity, velocity)
+    return ((leaving * leaving + speed2 * dot(apart, apart)) ** 0.5 + leaving) / speed2

@@ -292,15 +292,18 @@ def impulse(
             "--mirror", help="Reflection coefficient of pressure and rms height [m] of a shape, NAME=V,H: surface=-1,0.002."
         ),
     ] = None,
+    moving: options.Moving = None,
     config: Config = None,
     overwrite: options.Overwrite = False,
     resume: options.Resume = False,
 ) -> None:
     """Simulate channels, and write responses.npz, responses.zarr, response.png and waterfall.png into the folder OUT."""
+    from mitsonar.motion.bodies import MovingBodies
+    from mitsonar.motion.trajectory import convention_named
     from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.instrument_runs import iteration_error, run_impulse
     from mitsonar.simulation.runs import Destination
-    from mitsonar.simulation.scene import channel_sonar_in, find_scene
+    from mitsonar.simulation.scene import channel_sonar_in, digests_of, find_scene, read_motion_specs
 
     loaded, origin = _load(scene, parameter)
     sonar, attitude = _channel_sonar(channel_sonar_in(loaded), model, seed, set_ or [])
@@ -308,7 +311,11 @@ def impulse(
     folder = out or Path("out") / f"{find_scene(scene).stem}-impulse"
     parts = _mirrors(mirrors, mirror or [])
     origin |= {"mirrors": True if parts == "materials" else parts} if parts else {}
-    simulator = ChannelSimulator(loaded, sonar, mirrors=parts)
+    named = convention_named(frame).name
+    motions = _motions(loaded, moving, named)
+    bodies = MovingBodies.of(read_motion_specs(motions), named, flown)
+    origin |= {"moving": digests_of(motions)} if motions else {}
+    simulator = ChannelSimulator(loaded, sonar, mirrors=parts, moving=bodies)
     with progress_bar("measuring", len(flown), "pings") as progress:
         destination = Destination(folder, origin, overwrite, resume, progress, configuration_of(ctx))
         report = run_impulse(simulator, flown, speeds, destination)

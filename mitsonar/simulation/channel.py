@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.acoustics.materials import check_channel_mirrors
 from mitsonar.errors import MitsonarError, argument, suggest_names
 from mitsonar.instruments.hydrophones import PADDING, ChannelSonar
+from mitsonar.motion.bodies import Moving, MovingBodies
 from mitsonar.motion.pose import refuse_beyond_reach
 from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.records.responses import ImpulseResponses
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
 
     from mitsonar.simulation.mirror_paths import MirrorPaths
     from mitsonar.simulation.mirrors import Mirroring
-    from mitsonar.simulation.scatterers import ChannelTracer, EchoValues
+    from mitsonar.simulation.moving import SceneMotion
+    from mitsonar.simulation.scatterers import ChannelTracer, EchoValues, Moment
 
 __all__ = ["ChannelSimulator", "Channels", "Paths", "frequency_response", "impulse_response"]
 
@@ -123,6 +125,9 @@ class ChannelSimulator:
     are computed from image sources and include the phase of the carrier. Mirrors that are not flat, such as waves, reflect
     once.
 
+    Bodies may move, in the model ``scatterers``: their scatterers move with them, sound meets them where they are by then,
+    and they cast shadows. The kinds of their paths have their names. Heights are those above still shapes.
+
     Parameters of the scene may be changed at any time (``mi.traverse``): the next ping uses the changed scene.
 
     Args:
@@ -133,13 +138,15 @@ class ChannelSimulator:
             ``materials`` to use those of the shapes' materials.
         within: two opposite corners of a box ``(2, 3)`` [m]; scatterers outside are left out, which saves memory in a large
             scene (:meth:`~mitsonar.instruments.hydrophones.ChannelSonar.box_seen_from`); default: all.
+        moving: as in :class:`~mitsonar.Simulator`.
 
     Attributes:
         kinds: kinds of paths, named after what they meet in turn: ``scatterer``, ``surface-scatterer``, ``direct``,
             ``surface`` ...
 
     Raises:
-        MitsonarError: no surface can carry scatterers; a mirror is not in the scene; bounces without mirrors.
+        MitsonarError: no surface can carry scatterers; a mirror is not in the scene, or moves; bounces without mirrors; a
+            body deforms, or moves in the model ``rays``.
     """
 
     def __init__(
@@ -150,13 +157,12 @@ class ChannelSimulator:
         like: ChannelSimulator | None = None,
         mirrors: Mirroring = None,
         within: ArrayLike | None = None,
+        moving: Moving | MovingBodies | None = None,
     ) -> None:
         self.sonar = sonar
         from mitsonar.simulation.moving import SceneWatch
-        from mitsonar.simulation.scene import refuse_motion
 
-        refuse_motion(scene, "impulse responses")
-        self._given = scene, mirrors
+        self._given = scene, mirrors, moving
         self._within = None if within is None else np.asarray(within, dtype=float).reshape(2, 3)
         self._watch = SceneWatch(scene)
         if like is not None:
@@ -170,16 +176,21 @@ class ChannelSimulator:
 
     def _build(self, like: ChannelTracer | None = None) -> None:
         """Build everything that depends on the current scene: scatterers or surface tables, and mirrors."""
-        scene, mirrors = self._given
+        scene, mirrors, moving = self._given
         sonar = self.sonar
         from mitsonar.simulation.mirror_paths import MirrorPaths
-        from mitsonar.simulation.mirrors import mirror_of
+        from mitsonar.simulation.mirrors import mirror_of, refuse_moving_mirrors
+        from mitsonar.simulation.moving import motion_in
         from mitsonar.simulation.scatterers import ChannelTracer
 
+        motion = motion_in(scene, moving)
+        if motion is not None:
+            _check_motion(motion, sonar)
+            refuse_moving_mirrors(scene, mirrors, motion.bodies.shapes)
         parts = mirror_of(scene, mirrors) if mirrors else None
         check_channel_mirrors(sonar, parts is not None, MIRROR_ADVICE)
         self._without_mirrors = mirrors == "materials" and parts is None
-        self.tracer: ChannelTracer = ChannelTracer(scene, sonar, like, parts, self._within)
+        self.tracer: ChannelTracer = ChannelTracer(scene, sonar, like, parts, self._within, motion)
         self.without_scatterer: MirrorPaths = MirrorPaths(self.tracer)
         self.kinds = tuple([path.name for path in self.tracer.paths] + self.without_scatterer.names)
 
@@ -210,7 +221,7 @@ class ChannelSimulator:
         """
         parts = []
         velocity = velocities(flown) if velocity is None else velocity
-        for part in self.pings(flown.poses, velocity):
+        for part in self.pings(flown.poses, velocity, time_s=flown.time_s):
             parts.append(part)
             progress(len(part))
         return ImpulseResponses(
@@ -254,7 +265,14 @@ class ChannelSimulator:
         """Begin a new loop: the next :meth:`step` is ping 0."""
         self._stepped = 0
 
-    def pings(self, poses: ArrayLike, velocity: ArrayLike | None = None, *, first: int = 0) -> Iterator[Channels]:
+    def pings(
+        self,
+        poses: ArrayLike,
+        velocity: ArrayLike | None = None,
+        *,
+        first: int = 0,
+        time_s: ArrayLike | None = None,
+    ) -> Iterator[Channels]:
         """Simulate consecutive pings in batches, so that memory does not grow with their number.
 
         Args:
@@ -262,6 +280,7 @@ class ChannelSimulator:
             velocity: velocity in the vehicle's axes ``(pings, 4)``, starboard, forward, up [m/s], turn to starboard [rad/s],
                 or one for all pings ``(4,)``; default: at rest.
             first: number of the first ping.
+            time_s: times of the pings ``(pings,)`` [s], at which bodies are placed; default: number / ``frame_rate_hz``.
 
         Yields:
             The responses of each batch.
@@ -272,18 +291,23 @@ class ChannelSimulator:
         self._follow_scene()
         table = np.atleast_2d(np.asarray(poses, dtype=float))
         speeds = _checked(velocity, len(table), self.sonar.sound_speed)
+        numbers = first + np.arange(len(table))
+        times = numbers / self.sonar.frame_rate_hz if time_s is None else np.asarray(time_s, dtype=float)
         with ThreadPoolExecutor(thread_count()) as threads:
             for begin in range(0, len(table), PINGS_AT_A_TIME):
                 here = slice(begin, begin + PINGS_AT_A_TIME)
-                yield self._channels(table[here], speeds[here], first + begin, threads)
+                yield self._channels(table[here], speeds[here], times[here], first + begin, threads)
 
-    def paths(self, pose: ArrayLike, velocity: ArrayLike | None = None, receiver: int | str = 0) -> Paths:
+    def paths(
+        self, pose: ArrayLike, velocity: ArrayLike | None = None, receiver: int | str = 0, *, time_s: float = 0.0
+    ) -> Paths:
         """Trace the echoes of one ping at one receiver.
 
         Args:
             pose: pose of the transmitter: x, y, z [m], pitch, roll, heading [rad].
             velocity: as in :meth:`pings`.
             receiver: name or number of the receiver.
+            time_s: time of the ping [s], at which bodies are placed.
 
         Raises:
             MitsonarError: no such receiver, or a pose or velocity that is not valid.
@@ -295,9 +319,13 @@ class ChannelSimulator:
         receiver = self.sonar.receiver_number(receiver)
         speeds = _checked(velocity, 1, self.sonar.sound_speed)
         self._follow_scene()
+        moment = self._moment(time_s)
         parts = [
-            *(self.tracer.trace(table[0], speeds[0], receiver, FOR_PATHS, path=path) for path in self.tracer.paths),
-            *self.without_scatterer.trace(table[0], speeds[0], receiver, FOR_PATHS),
+            *(
+                self.tracer.trace(table[0], speeds[0], receiver, FOR_PATHS, path=path, moment=moment)
+                for path in self.tracer.paths
+            ),
+            *self.without_scatterer.trace(table[0], speeds[0], receiver, FOR_PATHS, moment),
         ]
         received = joined(parts)
         keep = received["counts"].astype(bool)
@@ -307,22 +335,35 @@ class ChannelSimulator:
         beyond = int(np.count_nonzero(received["beyond"]))
         return Paths(delay, size * np.exp(1j * phase), doppler, beyond, kind, self.kinds)
 
+    def _moment(self, time_s: float) -> Moment | None:
+        """Return the moving bodies at a time [s]; None if nothing moves."""
+        from mitsonar.simulation.scatterers import Moment
+
+        return None if self.tracer.motion is None else Moment.at(self.tracer.motion, time_s)
+
     def _channels(
-        self, poses: NDArray[np.float64], velocity: NDArray[np.float64], first: int, threads: ThreadPoolExecutor
+        self,
+        poses: NDArray[np.float64],
+        velocity: NDArray[np.float64],
+        time_s: NDArray[np.float64],
+        first: int,
+        threads: ThreadPoolExecutor,
     ) -> Channels:
         """Simulate a batch of pings; threads select points and transform echoes while the device traces."""
         shape = (len(poses), len(self.sonar.receivers))
-        paths = self.tracer.paths
+        paths, moments = self.tracer.paths, [self._moment(float(time)) for time in time_s]
         each = [(k, receiver, path) for k, receiver in np.ndindex(shape) for path in paths]
         # select the points of all launches ahead, in threads
-        candidates = [threads.submit(self.tracer.candidates, poses[k], receiver, path) for k, receiver, path in each]
+        candidates = [
+            threads.submit(self.tracer.candidates, poses[k], receiver, path, moments[k]) for k, receiver, path in each
+        ]
         transforms = []
         parts: list[EchoValues] = []
         # trace one kind of path after another; a response is transformed once all its kinds have arrived
         for (k, receiver, path), ready in zip(each, candidates, strict=True):
-            parts.append(self.tracer.trace(poses[k], velocity[k], receiver, FOR_RESPONSES, ready.result(), path))
+            parts.append(self.tracer.trace(poses[k], velocity[k], receiver, FOR_RESPONSES, ready.result(), path, moments[k]))
             if len(parts) == len(paths):
-                parts += self.without_scatterer.trace(poses[k], velocity[k], receiver, FOR_RESPONSES)
+                parts += self.without_scatterer.trace(poses[k], velocity[k], receiver, FOR_RESPONSES, moments[k])
                 transforms.append(threads.submit(_one_response, self.sonar, parts))
                 parts = []
         response, echoes, dropped = zip(*(future.result() for future in transforms), strict=True)
@@ -333,6 +374,22 @@ class ChannelSimulator:
             echoes=np.reshape(echoes, shape).astype(np.int64),
             dropped=np.reshape(dropped, shape).astype(np.int64),
         )
+
+
+def _check_motion(motion: SceneMotion, sonar: ChannelSonar) -> None:
+    """Check that responses can be simulated while bodies move.
+
+    Raises:
+        MitsonarError: the sonar has the model ``rays``, or a body deforms.
+    """
+    if sonar.model != "scatterers":
+        raise MitsonarError(
+            f"bodies move in the model scatterers only: got {sonar.model} while {motion.bodies.shapes[0]} moves; choose "
+            "--model scatterers, or remove its trajectory"
+        )
+    if motion.deformed:
+        name = motion.deformed[0].mesh.id()
+        raise MitsonarError(f"impulse responses need rigid bodies: {name} deforms; give it a path without meshes")
 
 
 def joined(parts: list[EchoValues]) -> EchoValues:

@@ -129,7 +129,10 @@ def run_impulse(
         "poses_sha256": path_digest(flown),
         "velocity": velocity[0].tolist() if len(np.unique(velocity, axis=0)) == 1 else "of the path",
     }
-    paths = [simulator.paths(flown.poses[0], velocity[:1], receiver) for receiver in range(len(sonar.receivers))]
+    begun = float(flown.time_s[0])
+    paths = [
+        simulator.paths(flown.poses[0], velocity[:1], receiver, time_s=begun) for receiver in range(len(sonar.receivers))
+    ]
     spread = spread_of(paths)
     if not any(path.amplitude.size for path in paths):
         _refuse_silence(simulator, flown, paths)
@@ -171,7 +174,7 @@ def _write_responses(
     try:
         group = zarr.open_group(url, mode="r+", zarr_format=3)
         _check_store(group, len(flown), simulator.sonar)
-        for part in simulator.pings(flown.poses[done:], velocity[done:], first=done):
+        for part in simulator.pings(flown.poses[done:], velocity[done:], first=done, time_s=flown.time_s[done:]):
             batch = slice(part.first, part.first + len(part))
             for name in ("response", "height_m", "echoes", "dropped"):
                 group[name][batch] = getattr(part, name)  # type: ignore[index]
@@ -205,8 +208,9 @@ def _refuse_silence(simulator: ChannelSimulator, flown: Trajectory, paths: list[
         MitsonarError: the middle and the last ping have no echo either.
     """
     sonar = simulator.sonar
-    for pose in flown.poses[[len(flown) // 2, -1]]:
-        if any(simulator.paths(pose, None, receiver).amplitude.size for receiver in range(len(sonar.receivers))):
+    for k in (len(flown) // 2, -1):
+        pose, time_s = flown.poses[k], float(flown.time_s[k])
+        if any(simulator.paths(pose, None, one.name, time_s=time_s).amplitude.size for one in sonar.receivers):
             return
     beyond = sum(path.dropped for path in paths)
     x, y, z, pitch, *_ = flown.poses[0]
@@ -588,7 +592,8 @@ def _run_sensor(
             SounderSimulator(scene, instrument, moving=bodies), flown, destination, frame=options.frame
         ).warnings
     if isinstance(instrument, ChannelSonar):
-        return run_impulse(ChannelSimulator(scene, instrument), flown, velocities(flown), destination).warnings
+        simulator = ChannelSimulator(scene, instrument, moving=bodies)
+        return run_impulse(simulator, flown, velocities(flown), destination).warnings
     run_camera(CameraSimulator(scene, instrument, moving=bodies), flown, destination, frame=options.frame)
     return []
 

@@ -24,7 +24,8 @@ from mitsonar.simulation.mirrors import (
     mirror_sequences,
     unfolded,
 )
-from mitsonar.simulation.scatterers import ChannelTracer, EchoValues, absorption_rate, link_table
+from mitsonar.simulation.moving import MovingScene
+from mitsonar.simulation.scatterers import ChannelTracer, EchoValues, Moment, absorption_rate, link_table
 from mitsonar.simulation.tracing import hidden
 
 __all__ = ["APART_M", "FacetEchoes", "MirrorPaths", "facet_echoes", "half_fresnel_m", "phase_mean"]
@@ -62,7 +63,12 @@ class MirrorPaths:
         self.notes: list[str] = []
 
     def trace(
-        self, pose: NDArray[np.float64], velocity: NDArray[np.float64], receiver: int, fields: Sequence[str]
+        self,
+        pose: NDArray[np.float64],
+        velocity: NDArray[np.float64],
+        receiver: int,
+        fields: Sequence[str],
+        moment: Moment | None = None,
     ) -> list[EchoValues]:
         """Return the paths of one ping at one receiver: a list of echo values, one entry for each of :attr:`names`.
 
@@ -71,25 +77,32 @@ class MirrorPaths:
             velocity: velocity of the vehicle in its own axes ``(4,)`` [m/s, rad/s].
             receiver: index of the receiver.
             fields: names of the values to return.
+            moment: of the ping, if bodies move.
         """
+        scene = self.scene if moment is None else moment.scene
         table = link_table(self.sonar, receiver, pose, velocity)
         echoes = [
             part
             for length, sequences in self.sequences.items()
-            for part in self._by_planes(table, receiver, length, sequences)
+            for part in self._by_planes(table, receiver, length, sequences, scene)
         ]
-        echoes += [self._by_facets(table, receiver, mirror) for mirror in self.facets]
+        echoes += [self._by_facets(table, receiver, mirror, scene) for mirror in self.facets]
         return [{name: part[name] for name in fields} for part in echoes]
 
     def _by_planes(
-        self, table: NDArray[np.float64], receiver: int, length: int, sequences: list[MirrorSequence]
+        self,
+        table: NDArray[np.float64],
+        receiver: int,
+        length: int,
+        sequences: list[MirrorSequence],
+        scene: mi.Scene | MovingScene,
     ) -> list[EchoValues]:
         """Return the paths via sequences of ``length`` planes, one entry for each sequence."""
         # 1. image sources, and which of them the receiver sees through its mirrors
         sent_from, received_at = table[0:3], table[3:6]
         image = np.array([sequence.images(sent_from)[-1] for sequence in sequences])
         rows = np.array([sequence.rows(sent_from, self.registry) for sequence in sequences])
-        is_open, factor = self._open(image, received_at, rows, length)
+        is_open, factor = self._open(image, received_at, rows, length, scene)
         # 2. direction and distance from the receiver to the image
         to_image = image - received_at
         distance = np.linalg.norm(to_image, axis=1)
@@ -120,7 +133,12 @@ class MirrorPaths:
         )
 
     def _open(
-        self, image: NDArray[np.float64], received_at: NDArray[np.float64], rows: NDArray[np.float64], length: int
+        self,
+        image: NDArray[np.float64],
+        received_at: NDArray[np.float64],
+        rows: NDArray[np.float64],
+        length: int,
+        scene: mi.Scene | MovingScene,
     ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
         """Return which paths are unobstructed ``(n,)``, and the products of their reflection coefficients ``(n,)``."""
         if length not in self.launches:
@@ -128,21 +146,23 @@ class MirrorPaths:
         inputs = [np.broadcast_to(received_at, image.shape), image, rows.reshape(len(image), -1)]
         table = np.concatenate(inputs, axis=1)
         columns = mi.UInt32(padded(np.arange(len(image), dtype=np.uint32))), mi.Float64(padded(table.ravel()))
-        seen, factor = replayed(self.launches[length], *columns, self.scene)
+        seen, factor = replayed(self.launches[length], *columns, scene)
         return np.broadcast_to(np.array(seen), len(image)), np.broadcast_to(np.array(factor, dtype=float), len(image))
 
-    def _by_facets(self, table: NDArray[np.float64], receiver: int, mirror: MirrorFacets) -> EchoValues:
+    def _by_facets(
+        self, table: NDArray[np.float64], receiver: int, mirror: MirrorFacets, scene: mi.Scene | MovingScene
+    ) -> EchoValues:
         """Return the echoes of one reflection from the facets of a mirror that is not flat."""
         echoes = facet_echoes(mirror, table[0:3], table[3:6], table[9:12], self.sonar.carrier_hz, self.sonar.sound_speed)
         self._note_large_facets(mirror, table)
-        valid = echoes.lit & self._lit(mirror, table)
+        valid = echoes.lit & self._lit(mirror, table, scene)
         amplitude = echoes.amplitude * self._sensitivity(table, receiver, echoes.sent, echoes.received)
         if not self.sonar.spreads:
             amplitude = amplitude * echoes.length
         doppler = (echoes.sent @ table[6:9] + echoes.received @ table[9:12]) / self.sonar.wavelength_m
         return echo_values(self.sonar, echoes.delay, amplitude, doppler, valid)
 
-    def _lit(self, mirror: MirrorFacets, table: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def _lit(self, mirror: MirrorFacets, table: NDArray[np.float64], scene: mi.Scene | MovingScene) -> NDArray[np.bool_]:
         """Return which facets both transmitter and receiver see ``(facets,)``."""
         middle = mirror.corners.mean(axis=1)
         normal = np.cross(mirror.corners[:, 1] - mirror.corners[:, 0], mirror.corners[:, 2] - mirror.corners[:, 0])
@@ -151,7 +171,7 @@ class MirrorPaths:
         inputs = (middle, normal, *places)
         number = mi.UInt32(padded(np.arange(len(middle), dtype=np.uint32)))
         numbers = mi.Float(padded(np.concatenate(inputs, axis=1, dtype=np.float32).ravel()))
-        return np.broadcast_to(np.array(replayed(self.shadows, number, numbers, self.scene)), len(middle))
+        return np.broadcast_to(np.array(replayed(self.shadows, number, numbers, scene)), len(middle))
 
     def _note_large_facets(self, mirror: MirrorFacets, table: NDArray[np.float64]) -> None:
         """Add a note, once, if facets are too large for the integral."""

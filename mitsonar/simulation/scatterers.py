@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
@@ -35,11 +35,12 @@ from mitsonar.simulation.mirrors import (
     mirror_sequences,
     unfolded,
 )
+from mitsonar.simulation.moving import MovingScene, SceneMotion
 from mitsonar.simulation.points import Patches, SurfacePoints, lattice_points, lattice_size
 from mitsonar.simulation.tracing import height_below, hidden
 
 __all__ = [
-    *("DIRECT", "ChannelTracer", "EchoBatch", "EchoValues", "LinkGeometry", "ScattererPath", "Scatterers"),
+    *("DIRECT", "ChannelTracer", "EchoBatch", "EchoValues", "LinkGeometry", "Moment", "ScattererPath", "Scatterers"),
     *("absorption_rate", "link_table"),
 ]
 
@@ -52,15 +53,55 @@ _Launch: TypeAlias = Callable[..., list[DeviceArray]]
 
 
 class ScattererPath(NamedTuple):
-    """Mirrors between transmitter and scatterers, and between receiver and scatterers."""
+    """Mirrors between transmitter and scatterers, and between receiver and scatterers.
+
+    Attributes:
+        out: mirrors on the way out.
+        back: mirrors on the way back, from the receiver.
+        body: number of the moving body that the scatterers lie on, from 1; 0: still shapes.
+        target: name of that body.
+    """
 
     out: MirrorSequence = MirrorSequence()
     back: MirrorSequence = MirrorSequence()
+    body: int = 0
+    target: str = "scatterer"
 
     @property
     def name(self) -> str:
         """Return the names of what sound meets in turn, such as ``surface-scatterer-seabed``."""
-        return "-".join([name for name in (self.out.name, "scatterer", MirrorSequence(self.back.planes[::-1]).name) if name])
+        return "-".join([name for name in (self.out.name, self.target, MirrorSequence(self.back.planes[::-1]).name) if name])
+
+
+class Moment(NamedTuple):
+    """Moving bodies at the time of a ping.
+
+    Attributes:
+        scene: the scene at that time.
+        to_world: first three rows of the transform from each body's axes to the world ``(bodies, 3, 4)``.
+        velocity: of each body ``(bodies, 6)``, see :meth:`~mitsonar.motion.bodies.MovingBodies.velocities`.
+    """
+
+    scene: MovingScene
+    to_world: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+
+    @classmethod
+    def at(cls, motion: SceneMotion, time_s: float) -> Moment:
+        """Return the bodies of a scene at a time [s]."""
+        back = motion.bodies.from_world(time_s)[0]
+        turn = back[:, :, :3].swapaxes(1, 2)
+        to_world = np.concatenate([turn, -(turn @ back[:, :, 3:])], axis=2)
+        return cls(motion.scene_at(time_s), to_world, motion.bodies.velocities(time_s)[0])
+
+    def row(self, body: int) -> NDArray[np.float64]:
+        """Return the 18 numbers of a body for a launch: its transform, its velocity and its rotation."""
+        return np.concatenate([self.to_world[body - 1].ravel(), self.velocity[body - 1]])
+
+    def from_world(self, body: int, place: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Transform a place [m] in the world ``(3,)`` to the axes of a body."""
+        rows = self.to_world[body - 1]
+        return np.asarray(rows[:, :3].T @ (place - rows[:, 3]))
 
 
 DIRECT = ScattererPath()
@@ -76,6 +117,7 @@ class ChannelTracer:
         like: a tracer of the same scene, whose scatterers may be shared.
         mirrors: mirror parts of the scene's shapes.
         within: box that holds all points that matter, see :meth:`Scatterers.from_scene`.
+        motion: moving bodies of the scene; None if nothing moves.
 
     Attributes:
         notes: notes to the user about the scene's BSDFs.
@@ -94,14 +136,16 @@ class ChannelTracer:
         like: ChannelTracer | None = None,
         mirrors: Mirrors | None = None,
         within: NDArray[np.float64] | None = None,
+        motion: SceneMotion | None = None,
     ) -> None:
-        self.scene, self.sonar = scene, sonar
+        self.scene, self.sonar, self.motion = scene, sonar, motion
         surfaces = Surfaces.from_scene(scene)
         self.flat: FlatMirrors = flat_mirrors(scene, mirrors)
         self.notes = [*surfaces.notes, *self.flat.notes_on(sonar.bounces)]
         shapes = scene.shapes()
         self.registry = {plane.shape: registry_index(shapes[plane.shape]) for plane in self.flat.reflecting(2)}
-        self.paths = _scatterer_paths(self.flat, sonar.bounces)
+        bodies = () if motion is None else motion.bodies.names
+        self.paths = _scatterer_paths(self.flat, sonar.bounces, bodies)
         self.source: _WorldScatterers | _VehicleRays
         if sonar.model == "scatterers":
             shared = (
@@ -109,10 +153,20 @@ class ChannelTracer:
                 if like is not None and like.scene is scene and isinstance(like.source, _WorldScatterers)
                 else None
             )
-            self.source = _WorldScatterers(scene, sonar, shared, mirrors, within)
+            moved = {} if motion is None else motion.numbers
+            still = None if motion is None else frozenset(range(len(shapes))) - frozenset(moved.values())
+            self.source = _WorldScatterers(scene, sonar, shared, mirrors, within, still)
+            on_bodies = {
+                name: _WorldScatterers(scene, sonar, None, mirrors, None, frozenset({number}))
+                for name, number in moved.items()
+            }
+            self.on_bodies = [] if motion is None else [on_bodies[name] for name in motion.bodies.shapes]
+            sources = [self.source, *on_bodies.values()]
+            if motion is not None and not any(len(source.scatterers) for source in sources):
+                raise MitsonarError(NO_SCATTERERS)
         else:
             self.source = _VehicleRays(sonar, surfaces)
-        self.launches: dict[tuple[int, tuple[str, ...], int, int], _Launch] = {}
+        self.launches: dict[tuple[int, tuple[str, ...], int, int, bool], _Launch] = {}
 
     def trace(
         self,
@@ -122,6 +176,7 @@ class ChannelTracer:
         names: tuple[str, ...],
         points: NDArray[np.uint32] | None = None,
         path: ScattererPath = DIRECT,
+        moment: Moment | None = None,
     ) -> EchoValues:
         """Trace one ping at one receiver; return echo values, one for each point that it may receive from.
 
@@ -132,35 +187,50 @@ class ChannelTracer:
             names: names of the values to return.
             points: indices of the points to trace; default: those that the receiver may receive from.
             path: mirrors between sonar and points.
+            moment: of the ping, if bodies move.
         """
-        points = self.candidates(pose, receiver, path) if points is None else points
+        points = self.candidates(pose, receiver, path, moment) if points is None else points
         if not len(points):
             return {name: np.zeros(0) for name in names}
-        key = (receiver, names, len(path.out.planes), len(path.back.planes))
+        key = (receiver, names, len(path.out.planes), len(path.back.planes), path.body > 0)
         if key not in self.launches:
             self.launches[key] = self._compile(*key)
-        table = mi.Float64(padded(self._table(pose, velocity, receiver, path)))
-        launch, inputs = self.launches[key], (mi.UInt32(padded(points)), self.scene, table)
-        received = replayed(launch, *inputs, self.source.tables(receiver))
+        row = moment.row(path.body) if moment is not None and path.body else np.zeros(0)
+        table = mi.Float64(padded(np.concatenate([self._table(pose, velocity, receiver, path), row])))
+        scene = self.scene if moment is None else moment.scene
+        launch, inputs = self.launches[key], (mi.UInt32(padded(points)), scene, table)
+        received = replayed(launch, *inputs, self._source(path).tables(receiver))
         return {name: np.broadcast_to(np.array(values), len(points)) for name, values in zip(names, received, strict=True)}
 
-    def candidates(self, pose: NDArray[np.float64], receiver: int, path: ScattererPath = DIRECT) -> NDArray[np.uint32]:
+    def candidates(
+        self, pose: NDArray[np.float64], receiver: int, path: ScattererPath = DIRECT, moment: Moment | None = None
+    ) -> NDArray[np.uint32]:
         """Return indices of the points that a receiver may receive from, via the given mirrors."""
-        return self.source.candidates(self._table(pose, np.zeros(4), receiver, path), receiver)
+        table = self._table(pose, np.zeros(4), receiver, path)
+        if moment is not None and path.body:
+            table[3:6] = moment.from_world(path.body, table[3:6])
+            table[12:21] = (table[12:21].reshape(3, 3) @ moment.to_world[path.body - 1][:, :3]).ravel()
+        return self._source(path).candidates(table, receiver)
+
+    def _source(self, path: ScattererPath) -> _WorldScatterers | _VehicleRays:
+        """Return the source of the echoes of a kind of path."""
+        return self.on_bodies[path.body - 1] if path.body else self.source
 
     def _table(
         self, pose: NDArray[np.float64], velocity: NDArray[np.float64], receiver: int, path: ScattererPath
     ) -> NDArray[np.float64]:
         table = link_table(self.sonar, receiver, pose, velocity)
-        return table if path == DIRECT else mirrored_table(table, path.out, path.back, self.registry)
+        straight = not path.out.planes and not path.back.planes
+        return table if straight else mirrored_table(table, path.out, path.back, self.registry)
 
     def height_m(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the height of each pose above the surface straight below it ``(pings,)`` [m]; nan if there is none."""
         place = mi.Point3f(*(mi.Float(padded(axis.astype(np.float32))) for axis in poses[:, :3].T))
         return np.array(height_below(self.scene, place), dtype=float)
 
-    def _compile(self, receiver: int, names: tuple[str, ...], out: int, back: int) -> _Launch:
+    def _compile(self, receiver: int, names: tuple[str, ...], out: int, back: int, moves: bool) -> _Launch:
         """Record a receiver's launch for the given numbers of mirrors; later calls replay it (``dr.freeze``)."""
+        source = self.on_bodies[0] if moves else self.source
 
         @Frozen
         def launch(index: mi.UInt32, scene: mi.Scene, table: mi.Float64, tables: DeviceArray) -> list[DeviceArray]:
@@ -169,7 +239,8 @@ class ChannelTracer:
                 link = LinkGeometry(self.sonar, receiver, table)
             else:
                 link = MirroredLink(self.sonar, receiver, table, out, back)
-            received = self.source.received(link, index, scene, tables)
+            body = BodyPose.read(table, link.size) if moves else None
+            received = source.received(link, index, scene, tables, body)
             values = [getattr(received, name) for name in names]
             dr.eval(values)
             return values
@@ -177,10 +248,17 @@ class ChannelTracer:
         return launch
 
 
-def _scatterer_paths(flat: FlatMirrors, bounces: int) -> list[ScattererPath]:
+NO_SCATTERERS = (
+    "the scene has no surface that can carry scatterers: give it a shape with a diffuse BSDF, cell_noise or a bitmap as "
+    "reflectance, or raise points_per_m2"
+)
+
+
+def _scatterer_paths(flat: FlatMirrors, bounces: int, bodies: Sequence[str] = ()) -> list[ScattererPath]:
     """Return all kinds of scatterer paths with up to ``bounces`` reflections, counting the scatterer as one."""
     return [
-        ScattererPath(out, back)
+        ScattererPath(out, back, number, target)
+        for number, target in enumerate(["scatterer", *bodies])
         for mirrors in range(bounces)
         for outward in range(mirrors + 1)
         for out in mirror_sequences(flat.reflecting(bounces), outward)
@@ -188,8 +266,38 @@ def _scatterer_paths(flat: FlatMirrors, bounces: int) -> list[ScattererPath]:
     ]
 
 
+class BodyPose(NamedTuple):
+    """Pose and velocity of a moving body on the device: rows of its transform to the world, velocity and rotation."""
+
+    rows: list[list[DeviceArray]]
+    velocity: list[DeviceArray]
+    rotation: list[DeviceArray]
+
+    @classmethod
+    def read(cls, table: mi.Float64, begin: int) -> BodyPose:
+        """Read the numbers of :meth:`Moment.row` from a table."""
+        numbers = [dr.gather(mi.Float64, table, mi.UInt32(begin + k)) for k in range(18)]
+        dr.eval(numbers)
+        return cls([numbers[start : start + 4] for start in (0, 4, 8)], numbers[12:15], numbers[15:18])
+
+    def placed(self, point: list[DeviceArray]) -> list[DeviceArray]:
+        """Transform points [m] from the body's axes to the world."""
+        return [sum((a * b for a, b in zip(row, point, strict=False)), row[3]) for row in self.rows]
+
+    def turned(self, normal: mi.Normal3f) -> mi.Normal3f:
+        """Rotate normals from the body's axes to the world."""
+        return mi.Normal3f(*(sum(mi.Float(row[k]) * normal[k] for k in range(3)) for row in self.rows))
+
+    def velocity_at(self, place: list[DeviceArray]) -> list[DeviceArray]:
+        """Return the velocity [m/s] of the body's points at places in the world."""
+        arm = [p - row[3] for p, row in zip(place, self.rows, strict=True)]
+        spin = self.rotation
+        swing = [spin[(k + 1) % 3] * arm[(k + 2) % 3] - spin[(k + 2) % 3] * arm[(k + 1) % 3] for k in range(3)]
+        return [v + w for v, w in zip(self.velocity, swing, strict=True)]
+
+
 class _WorldScatterers:
-    """Source of echoes from scatterers that are fixed in the world."""
+    """Source of echoes from scatterers that are fixed in the world, or in the axes of a moving body."""
 
     def __init__(
         self,
@@ -198,8 +306,9 @@ class _WorldScatterers:
         like: _WorldScatterers | None,
         mirrors: Mirrors | None,
         within: NDArray[np.float64] | None,
+        among: frozenset[int] | None = None,
     ) -> None:
-        self.sonar, self.within = sonar, within
+        self.sonar, self.within, self.among = sonar, within, among
         self.scatterers: Scatterers
         self.stored: mi.Float
         self.smooth: frozenset[int] | None = None
@@ -209,10 +318,11 @@ class _WorldScatterers:
             )
             self.smooth = frozenset(places)
         same = like is not None and _points_of(like.sonar) == _points_of(sonar) and like.smooth == self.smooth
+        same = same and like is not None and like.among == among
         if like is not None and same and np.array_equal(like.within, within):  # type: ignore[arg-type]
             self.scatterers, self.stored = like.scatterers, like.stored
         else:
-            self.scatterers = Scatterers.from_scene(scene, sonar, self.smooth, within)
+            self.scatterers = Scatterers.from_scene(scene, sonar, self.smooth, within, among)
             self.stored = self._rows()
         self.wavenumber = 2 * math.pi / sonar.wavelength_m
         self.roughness: mi.Float | None = None  # rms height of each point's mirror; negative if it is no mirror
@@ -235,7 +345,9 @@ class _WorldScatterers:
         """Return the inputs of a launch: position, strength, normal and phase of all points; with mirrors also roughness."""
         return [self.stored] if self.roughness is None else [self.stored, self.roughness]
 
-    def received(self, link: LinkGeometry, index: mi.UInt32, scene: mi.Scene, tables: list[mi.Float]) -> EchoBatch:
+    def received(
+        self, link: LinkGeometry, index: mi.UInt32, scene: mi.Scene, tables: list[mi.Float], body: BodyPose | None = None
+    ) -> EchoBatch:
         """Return the echoes of the scatterers that transmitter and receiver see."""
         # 1. fetch position, strength, normal and phase
         first: DeviceArray = dr.gather(mi.Vector4f, tables[0], index * 2)
@@ -247,8 +359,12 @@ class _WorldScatterers:
         )
         # 2. delay in double precision, since it determines the phase of the carrier
         exact = [mi.Float64(value) for value in position]
+        moves: list[DeviceArray] | None = None
+        if body is not None:
+            exact, normal = body.placed(exact), body.turned(normal)
+            position, moves = mi.Point3f(*exact), body.velocity_at(exact)
         to_point, from_receiver = link.to_point(exact)
-        delay = delay_exact(to_point, from_receiver, link.velocity, self.sonar.sound_speed)
+        delay = delay_exact(to_point, from_receiver, link.velocity, self.sonar.sound_speed, moves)
         # 3. directions and distances; single precision is enough for amplitudes
         way_out, way_back = mi.Vector3f(*to_point), mi.Vector3f(*from_receiver)
         sent, received = dr.norm(way_out), dr.norm(way_back)
@@ -273,7 +389,7 @@ class _WorldScatterers:
             height = dr.gather(mi.Float, tables[1], index)
             lost = 1 - dr.exp(-dr.square(height * self.wavenumber * (cosines[0] + cosines[1])))
             amplitude *= dr.sqrt(dr.select(height < 0, 1, lost))
-        return link.echo_batch(delay, amplitude, second.w, link.doppler(u_sent, u_received), seen)
+        return link.echo_batch(delay, amplitude, second.w, link.doppler(u_sent, u_received, moves), seen)
 
 
 def _points_of(sonar: ChannelSonar) -> tuple[float | None, ...]:
@@ -299,9 +415,14 @@ class _VehicleRays:
         return self.stored[receiver], self.surfaces.arrays()
 
     def received(
-        self, link: LinkGeometry, index: mi.UInt32, scene: mi.Scene, tables: tuple[mi.Float64, LaunchTables]
+        self,
+        link: LinkGeometry,
+        index: mi.UInt32,
+        scene: mi.Scene,
+        tables: tuple[mi.Float64, LaunchTables],
+        body: BodyPose | None = None,
     ) -> EchoBatch:
-        """Return the echoes of the points that the rays hit."""
+        """Return the echoes of the points that the rays hit, on still shapes."""
         # 1. turn the directions from the axes of the field of view to the world
         directions, facets = tables
         local = [dr.gather(mi.Float64, directions, index * 3 + k) for k in range(3)]
@@ -477,13 +598,18 @@ class LinkGeometry:
         """
         return ~hidden(scene, point.position, point.normal, sent.u, sent.length, active), None
 
-    def doppler(self, sent: DeviceArray, received: DeviceArray) -> DeviceArray:
-        """Return the Doppler shift of the carrier [Hz], given unit directions to the points.
+    def doppler(
+        self, sent: DeviceArray, received: DeviceArray, point_velocity: list[DeviceArray] | None = None
+    ) -> DeviceArray:
+        """Return the Doppler shift of the carrier [Hz], given unit directions to the points and their velocity.
 
         The shift is positive where the vehicle approaches the point, because both legs of the path get shorter. In a turn,
         transmitter and receiver have different velocities. Terms of second order in velocity over sound speed are neglected.
         """
         sender, receiver = (mi.Vector3f(*self.vector(start)) for start in (6, 9))
+        if point_velocity is not None:
+            point = mi.Vector3f(*point_velocity)
+            sender, receiver = sender - point, receiver - point
         return (dr.dot(sent, sender) + dr.dot(received, receiver)) * (1 / self.sonar.wavelength_m)
 
     def echo_batch(
@@ -647,6 +773,7 @@ class Scatterers:
         sonar: ChannelSonar,
         smooth: frozenset[int] | None = None,
         within: NDArray[np.float64] | None = None,
+        among: frozenset[int] | None = None,
     ) -> Scatterers:
         """Place scatterers on a scene's shapes.
 
@@ -655,13 +782,15 @@ class Scatterers:
             sonar: instrument that gives number and seed of the points.
             smooth: indices of perfect mirrors in the scene, which scatter nothing; if given, there may be no points at all.
             within: two opposite corners of a box ``(2, 3)`` [m]; points outside are left out, those inside stay the same.
+            among: indices of the shapes that may carry points; if given, there may be no points at all.
 
         Raises:
             MitsonarError: no surface can carry scatterers, or there are more than :data:`MOST`.
         """
         parts, closed, shapes = [], [], []
         for number, shape in enumerate(scene.shapes()):
-            if shape.bsdf() is not None and number not in (smooth or ()) and not is_black(shape.bsdf()):
+            chosen = among is None or number in among
+            if chosen and shape.bsdf() is not None and number not in (smooth or ()) and not is_black(shape.bsdf()):
                 if shape.class_name() == "Instance":
                     raise MitsonarError(
                         f"scatterers cannot lie on instances: got {shape.id()}; give the scene meshes instead"
@@ -674,7 +803,7 @@ class Scatterers:
                 parts.append(some)
                 closed.append(np.full(len(parts[-1].strength), isinstance(shape, mi.Mesh) and _is_closed(shape)))
                 shapes.append(np.full(len(parts[-1].strength), number, np.int32))
-        if not sum(map(len, closed)) and smooth is not None:
+        if not sum(map(len, closed)) and not (smooth is None and among is None):
             none = np.zeros((0, 3), np.float32)
             return cls(none, none, none[:, 0], none[:, 0], np.zeros(0, np.int32), np.zeros(1, np.int64), np.zeros(0, bool))
         if not sum(map(len, closed)):
@@ -684,10 +813,7 @@ class Scatterers:
                     f"the scene has no surface within reach that can carry scatterers, from ({low}) to ({high}) m: move the "
                     "path, or raise range_max"
                 )
-            raise MitsonarError(
-                "the scene has no surface that can carry scatterers: give it a shape with a diffuse BSDF, cell_noise or a "
-                "bitmap as reflectance, or raise points_per_m2"
-            )
+            raise MitsonarError(NO_SCATTERERS)
         place, normal, strength, phase = (np.concatenate(values) for values in zip(*parts, strict=True))
         one_sided = np.concatenate(closed)
         order, first = _buckets(place, np.where(one_sided, _side(normal), 0))

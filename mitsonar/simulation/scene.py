@@ -47,7 +47,6 @@ __all__ = [
     "motions_of",
     "object_names_in",
     "read_motion_specs",
-    "refuse_motion",
     "refuse_unread_motions",
     "scale_notes",
     "shape_boxes_in",
@@ -462,21 +461,6 @@ def digests_of(specs: Sequence[MotionSpec]) -> dict[str, str]:
         ]
         digests[name] = digest(digests.get(name, "").encode(), *(part.encode() for part in parts))
     return digests
-
-
-def refuse_motion(scene: mi.Scene, what: str) -> None:
-    """Reject a scene with moving shapes.
-
-    Args:
-        scene: the scene to check.
-        what: plural noun for the caller's results, which begins the message.
-
-    Raises:
-        MitsonarError: a shape moves.
-    """
-    specs = motion_specs_of(scene)
-    if specs:
-        raise MitsonarError(f"{what} need a still scene: {specs[0].name} has a trajectory; remove its texture motion")
 
 
 def refuse_unread_motions(state: mi.parser.ParserState) -> None:

@@ -108,19 +108,8 @@ class VehicleSimulator:
         return sensors_in(self.scene, Pose.from_row(vehicle.poses[0])) if self._sensors is None else self._sensors
 
     def bodies(self, vehicle: Trajectory) -> MovingBodies:
-        """Return the bodies that move while the vehicle follows a trajectory.
-
-        Raises:
-            MitsonarError: a body moves, but a sensor supports still scenes only.
-        """
-        bodies = MovingBodies.of(self.moving, vehicle=vehicle)
-        channel_sonars = [name for name, one in self.sensors(vehicle).items() if isinstance(one.instrument, ChannelSonar)]
-        if len(bodies) and channel_sonars:
-            raise MitsonarError(
-                f"impulse responses need a still scene: {bodies.shapes[0]} moves, and {channel_sonars[0]} is a channel "
-                "sonar; remove one of them"
-            )
-        return bodies
+        """Return the bodies that move while the vehicle follows a trajectory."""
+        return MovingBodies.of(self.moving, vehicle=vehicle)
 
     def render(self, vehicle: Trajectory, *, labels: bool = False) -> dict[str, Record]:
         """Render all sensors into memory; return frames, soundings, responses or pictures, keyed by sensor name.
@@ -141,8 +130,7 @@ class VehicleSimulator:
             sounder = SounderSimulator(self.scene, instrument, moving=bodies)
             return sounder.echogram(path) if instrument.kind == "sidescan" else sounder.soundings(path)
         if isinstance(instrument, ChannelSonar):
-            return ChannelSimulator(self.scene, instrument).responses(path)
-
+            return ChannelSimulator(self.scene, instrument, moving=bodies).responses(path)
         return np.stack(list(CameraSimulator(self.scene, instrument, moving=bodies).pictures(path.poses, path.time_s)))
 
 

@@ -145,7 +145,7 @@ def test_crests_hide_facets_from_a_sonar_at_grazing(tmp_path: Path) -> None:
     result = ChannelSimulator(scene, instrument(receivers=(one,)), mirrors={"surface": (-1.0, 0.0)})
     (waves,) = result.tracer.flat.facets
     place = Pose(0, -11.0, 8.8)
-    seen = result.without_scatterer._lit(waves, link_table(result.sonar, 0, np.array(place), np.zeros(4)))
+    seen = result.without_scatterer._lit(waves, link_table(result.sonar, 0, np.array(place), np.zeros(4)), scene)
     some = slice(None, None, 23)
     middle, seen = waves.corners[some].mean(axis=1), seen[some]
     part = np.linspace(0.003, 0.997, 500)[:, None]

@@ -42,3 +42,21 @@ def test_delays_hold_their_phase_at_320_khz_and_25_m() -> None:
     vv = sum(mpmath.mpf(x) ** 2 for x in v)
     exact = tau0 + (mpmath.sqrt(qv**2 + (mpmath.mpf(1500) ** 2 - vv) * qq) - qv) / (mpmath.mpf(1500) ** 2 - vv)
     assert abs(float(delay_exact(p, b, v, C) - exact)) * 320e3 < 1e-10
+
+
+def test_sound_meets_a_moving_point_where_it_is_by_then() -> None:
+    """Both ways solve their equations: |d + u t| = c t, then |q + (u - v) t - v s| = c s."""
+    rng = np.random.default_rng(2)
+    to_point, velocity, moves = rng.normal(0, 8, (3, 500)), rng.uniform(-3, 3, (3, 500)), rng.uniform(-30, 30, (3, 500))
+    from_receiver = to_point + rng.normal(0, 0.3, (3, 500))
+    delay = delay_exact(to_point, from_receiver, velocity, C, moves)
+    # the time of the meeting by bisection, independent of the closed form
+    low, high = np.zeros(500), np.full(500, 1.0)
+    for _ in range(60):
+        middle = (low + high) / 2
+        late = np.linalg.norm(to_point + moves * middle, axis=0) < C * middle
+        low, high = np.where(late, low, middle), np.where(late, middle, high)
+    left = np.linalg.norm(from_receiver + moves * low - velocity * delay, axis=0)
+    assert np.abs(left - C * (delay - low)).max() < 1e-11 * C
+    still = delay_exact(to_point, from_receiver, velocity, C, np.zeros((3, 500)))
+    assert np.abs(still - delay_exact(to_point, from_receiver, velocity, C)).max() < 1e-17
