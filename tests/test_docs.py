@@ -168,8 +168,8 @@ def test_the_recipe_for_a_mavlink_log_makes_sensors(tmp_path: Path, monkeypatch:
     log = SimpleNamespace(recv_match=lambda type: sent.pop(0))
     stand_in = SimpleNamespace(mavutil=SimpleNamespace(mavlink_connection=lambda name: log))
     monkeypatch.setitem(sys.modules, "pymavlink", stand_in)
-    (block,) = (one for one in blocks_of(DOCS / "tutorials/bluerov.md") if "pymavlink" in one.text)
-    run_python(block.text, "bluerov.md", tmp_path)
+    (block,) = (one for one in blocks_of(DOCS / "reference/files.md") if "pymavlink" in one.text)
+    run_python(block.text, "files.md", tmp_path)
     sensors = load_sensors(tmp_path / "sensors.csv")
     assert sensors.yaw_rate is not None
     assert sensors.depth is not None

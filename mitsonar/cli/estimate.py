@@ -503,7 +503,10 @@ def crlb(
         str | None, typer.Option(help="Of a data set: train, validation, test (default if the split has one) or all.")
     ] = None,
     vary: Annotated[
-        str | None, typer.Option(help="NAME=V1,V2,...: height_m, pitch_deg, azimuth_fov_deg, beams, window=3.2..5.6 ...")
+        str | None,
+        typer.Option(
+            help="NAME=V1,V2: height_m, pitch_deg, azimuth_fov_deg, elevation_fov_deg, beams, range_bins, window=3.2..5.6."
+        ),
     ] = None,
     gain: Annotated[float | None, typer.Option(help="Constant gain (default: the data set's, or from the frames).")] = None,
     pings: Annotated[

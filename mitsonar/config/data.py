@@ -338,7 +338,7 @@ class Recipe(RecipePart):
     """The recipe of a data set.
 
     Angles are in degrees and motions in millimetres; all other values have SI units. The keys are documented in
-    docs/guides/data-sets.md.
+    docs/reference/files.md.
 
     Raises:
         MitsonarError: through :func:`load_recipe`, a key is unknown or a value is outside its limits.
@@ -351,8 +351,8 @@ class Recipe(RecipePart):
         default_factory=dict, description="family of the world, and its parameters; empty for recorded frames"
     )
     scenes: list[Scenes] = Field(min_length=1, description="the scenes, each with its sequences")
-    sonar: Keys | None = Field(None, description="preset and keys of docs/guides/sonars.md")
-    channel: Keys | None = Field(None, description="for responses: keys of docs/guides/impulse-responses.md")
+    sonar: Keys | None = Field(None, description="preset and keys of docs/reference/plugins.md")
+    channel: Keys | None = Field(None, description="for responses: keys of docs/reference/plugins.md")
     mount: Mount = Field(
         default_factory=lambda: Mount(pitch_deg=35.0), description="pose of the sonar on the vehicle; not with channel"
     )
@@ -666,7 +666,7 @@ def _validated(part: type[_PartT], what: str, fields: Keys) -> _PartT:
     try:
         return part(**fields)
     except ValidationError as error:
-        raise MitsonarError(validation_message(error, part, what, " (see docs/guides/data-sets.md)")) from None
+        raise MitsonarError(validation_message(error, part, what, " (see docs/reference/files.md)")) from None
     except TypeError as error:
         raise MitsonarError(f"{what} keys must be strings: {error}") from None
 

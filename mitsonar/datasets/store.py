@@ -1,6 +1,6 @@
 """How a data set is stored on disk or in object storage: one Zarr v3 group, written shard by shard.
 
-docs/guides/data-sets.md describes the format.
+docs/reference/files.md describes the format.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ __all__ = [
 
 
 FORMAT = 1
-"""Version of the format that docs/guides/data-sets.md describes."""
+"""Version of the format that docs/reference/files.md describes."""
 
 PACKAGES = ("mitsonar", "mitsuba", "drjit", "numpy", "finufft", "zarr")
 """Packages whose versions a store records."""

@@ -23,7 +23,7 @@ __all__ = [
 ]
 
 ChannelModel = Literal["scatterers", "rays"]
-SEE = " (see docs/guides/impulse-responses.md)"
+SEE = " (see docs/reference/plugins.md)"
 
 PADDING = 2
 """Oversampling factor of the frequency response.
@@ -301,7 +301,7 @@ class ChannelSonar(Instrument):
     """A continuous transmitter, and receivers whose channels are measured continuously (Almanza-Medina, ch. 5).
 
     Angles are in degrees, all other quantities in SI units. The same names serve as XML properties of the sensor
-    ``channel_sonar`` (docs/guides/impulse-responses.md).
+    ``channel_sonar`` (docs/reference/plugins.md).
 
     Raises:
         MitsonarError: an unknown key, or a value outside its limits.

@@ -374,7 +374,7 @@ FieldValue: TypeAlias = Any
 Model = Literal["coherent", "physical", "thesis"]
 Coding = Literal["linear", "dB", "gamma"]
 Bearing = Literal["azimuth", "cone"]
-SEE = " (see `mitsonar presets --help` and docs/guides/sonars.md)"
+SEE = " (see `mitsonar presets --help` and docs/reference/plugins.md)"
 RAYS = ("rays_per_beam", "rays_across")
 """Fields that are derived from ``quality`` unless given."""
 
@@ -441,7 +441,7 @@ class Sonar(Instrument):
     """An imaging sonar, with angles in degrees and all other quantities in SI units.
 
     The same names serve as XML properties of the sensor ``imaging_sonar`` and as keys of a sonar's YAML file
-    (``docs/guides/sonars.md``).
+    (``docs/reference/plugins.md``).
 
     In the physical and coherent models, ``rays_per_beam`` and ``rays_across`` are derived from ``quality``. In the
     ``thesis`` model they are ``thesis_rays`` and one. Explicit values take precedence.

@@ -98,7 +98,7 @@ def test_the_layers_are_those_of_the_table() -> None:
     assert kernels == [(7, 4), (5, 4), *[(3, 4)] * 7]
     assert network.regression.in_features == 4 * 512 * 2 * 4
     standard = create_network("impulse_posenet")
-    assert round(sum(part.numel() for part in standard.parameters()) / 1e6, 1) == 33.7  # docs/guides/networks.md
+    assert round(sum(part.numel() for part in standard.parameters()) / 1e6, 1) == 33.7  # docs/reference/files.md
     assert isinstance(network.nets[0][-2], SameAverage)
 
 

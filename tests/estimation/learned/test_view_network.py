@@ -154,7 +154,7 @@ def test_the_layers_are_those_of_the_table(columns: int) -> None:
         tuple(part.get_parameter("weight").shape[-2:]) for part in layers.children() if type(part).__name__ == "SameConv2d"
     ]
     assert kernels == [(7, 2), (5, 2), *[(3, 2)] * 7]
-    assert sum(part.numel() for part in network.parameters()) == 13_649_283 + (columns - 2) * 3072  # docs/guides/networks.md
+    assert sum(part.numel() for part in network.parameters()) == 13_649_283 + (columns - 2) * 3072  # docs/reference/files.md
 
 
 @pytest.mark.parametrize("size", [(16, 8), (1024, 4), (512, 1)])
