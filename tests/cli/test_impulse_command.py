@@ -200,6 +200,25 @@ def test_a_sea_surface_is_a_mirror_of_ones_own_scene(mitsonar: Command, tmp_path
     assert np.abs(runs["own"] - runs["none"]).max() > 0.1 * np.abs(runs["none"]).max()
 
 
+def test_bodies_move(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
+    """The command places a body at the times of its pings, and says on which path it went."""
+    fish = '<shape type="cube" id="fish"><transform name="to_world"><scale value="0.3"/></transform></shape></scene>'
+    scene.write_text(scene.read_text().replace("</scene>", fish))
+    (tmp_path / "fish.tum").write_text("0 0 0 4 0 0 0 1\n0.1 2 0 4 0 0 0 1\n")
+    runs = {}
+    for name, more in {"moves": ["--moving", f"fish={tmp_path / 'fish.tum'}"], "rests": []}.items():
+        done = mitsonar("impulse", scene, "--frames", 2, "--set", "points_per_m2=50", *more, "-o", tmp_path / name)
+        assert done.returncode == 0, done.stderr
+        runs[name] = ImpulseResponses.load(tmp_path / name).response[:, 0]
+    early = slice(0, 8 * 12)  # before 9 m there and back: the fish alone
+    assert np.abs(runs["rests"][:, early]).max() < 0.2 * np.abs(runs["moves"][:, early]).max()
+    first, later = np.abs(runs["moves"][:, early])
+    assert np.abs(first - later).max() > 0.2 * first.max()
+    assert "fish" in json.loads((tmp_path / "moves" / "run.json").read_text())["asked"]["moving"]
+    done = mitsonar("impulse", scene, "--model", "rays", "--moving", f"fish={tmp_path / 'fish.tum'}", "-o", tmp_path / "x")
+    refused(done, "model scatterers only", "got rays while fish moves")
+
+
 def test_mirrors_that_do_not_fit_are_refused(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     for given, *words in (
         (["--mirror", "floor=-1"], "--mirror NAME=V,H takes 2 numbers, separated by commas: got '-1'"),
