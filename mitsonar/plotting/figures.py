@@ -59,7 +59,10 @@ ALMANZA_COLOURS = {
 OTHER_COLOURS = (("tab:orange", "tab:brown"), ("tab:purple", "tab:pink"), ("tab:olive", "tab:gray"))
 
 ARROWS = 20
-"""Approximate number of headings drawn along a path."""
+"""Largest number of headings drawn along a path."""
+
+ARROW_TURN_RAD = math.radians(20)
+"""Turn after which a heading is drawn again, however short the way."""
 
 UNSEEN_COLOUR = "0.9"
 """Grey of cells that no frame observed."""
@@ -319,11 +322,14 @@ def _label_path(above: Axes, over_time: list[Axes], title: str) -> None:
 
 def _draw_paths(axes: Axes, paths: Mapping[str, Trajectory]) -> None:
     """Draw lines with arrows along the heading and a mark at the start, which the legend explains."""
-    for name, line, arrow in _path_colours(paths):
+    colours = list(_path_colours(paths))
+    for name, line, _ in colours:
         poses = paths[name].poses
         axes.plot(poses[:, 0], poses[:, 1], color=line, label=name, linewidth=1.5, zorder=3)
         axes.plot(*poses[0, :2], marker="o", color=line, markersize=4, zorder=3)
-        arrow_poses = poses[_sample_indices(len(poses))]
+    spacing_m = max(axes.dataLim.width, axes.dataLim.height) / ARROWS
+    for name, _, arrow in colours:
+        arrow_poses = paths[name].poses[_arrow_indices(paths[name].poses, spacing_m)]
         direction = np.sin(arrow_poses[:, 5]), np.cos(arrow_poses[:, 5])
         axes.quiver(*arrow_poses[:, :2].T, *direction, color=arrow, scale=25, width=0.003, zorder=4)
     if paths:
@@ -334,6 +340,17 @@ def _draw_paths(axes: Axes, paths: Mapping[str, Trajectory]) -> None:
 def _sample_indices(frames: int) -> NDArray[np.intp]:
     """Return the numbers of the frames that get arrows and ellipses, evenly spread."""
     return np.unique(np.linspace(0, frames - 1, min(ARROWS, frames)).astype(np.intp))
+
+
+def _arrow_indices(poses: NDArray[np.float64], spacing_m: float) -> list[int]:
+    """Return the numbers of the frames that get arrows: those some way [m] or some turn after the one before."""
+    chosen: list[int] = []
+    for index in _sample_indices(len(poses)).tolist():
+        last = poses[chosen[-1]] if chosen else None
+        turn = 0.0 if last is None else abs(math.remainder(poses[index, 5] - last[5], 2 * math.pi))
+        if last is None or math.dist(poses[index, :2], last[:2]) >= spacing_m or turn > ARROW_TURN_RAD:
+            chosen.append(index)
+    return chosen
 
 
 def _draw_ellipses(axes: Axes, positions: NDArray[np.float64], covariance: NDArray[np.float64], colour: str) -> None:
