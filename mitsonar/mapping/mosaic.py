@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument, count_noun, suggest_names
+from mitsonar.estimation.image.ping_groups import along_path
 from mitsonar.geometry.ground import GroundGeometry, moved
 from mitsonar.instruments.views import directions
 from mitsonar.io.files import write_atomic
@@ -197,6 +198,8 @@ class Mosaic:
     ) -> None:
         """Add frames to the map.
 
+        Beams that ping in groups are moved to the middle of their frame, if at least two frames are added at once.
+
         Args:
             frames: some frames of the run.
             poses: pose of the sonar at each frame ``(frames, 6)`` [m, rad]; default: those of the frames.
@@ -206,8 +209,10 @@ class Mosaic:
         Raises:
             MitsonarError: there are no poses or heights, their numbers do not fit, or the map would exceed ``most_cells``.
         """
-        images = self._flat(levels_of(frames))
+        images = levels_of(frames)
         table, heights = poses_and_heights(frames, poses, height_m)
+        of_one_moment = along_path(frames, table, heights)
+        images = self._flat(images if of_one_moment is frames else levels_of(of_one_moment))
         if np.shape(whole) not in ((), (len(frames),)):
             raise MitsonarError(f"whole must be one boolean, or one for each of {len(frames)} frames: got {np.shape(whole)}")
         entire = np.broadcast_to(np.asarray(whole, dtype=bool), len(frames))

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from mitsonar.estimation.estimator import AnyEstimator, Estimate, Record
 from mitsonar.instruments.sonar import group_of_beams, ping_interval_s, ping_offsets_s, scans
-from mitsonar.motion.composition import Motion, MotionPrior
+from mitsonar.motion.composition import Motion, MotionPrior, motions
 from mitsonar.records.frames import SonarFrames
 
-__all__ = ["at_one_moment", "estimate_pair"]
+__all__ = ["along_path", "at_one_moment", "estimate_pair"]
 
 Array = NDArray[np.float64]
 
@@ -49,17 +49,33 @@ LEAST_SHARE = 0.05
 """Duration of a frame's pings, relative to the time between both frames, below which they count as one ping."""
 
 
-def _in_groups(pair: Record) -> TypeGuard[SonarFrames]:
-    """Test for two frames whose pings last a part of the time between them; the sweep of a turning head is not one frame."""
-    if not isinstance(pair, SonarFrames) or pair.sonar.ping_groups == 1 or scans(pair.sonar):
+def _in_groups(frames: Record) -> TypeGuard[SonarFrames]:
+    """Test for frames whose pings last a part of the time between them; the sweep of a turning head is not one frame."""
+    if not isinstance(frames, SonarFrames) or frames.sonar.ping_groups == 1 or scans(frames.sonar) or len(frames) < 2:
         return False
-    duration_s = pair.sonar.ping_groups * ping_interval_s(pair.sonar)
-    return len(pair.bearing_rad) == pair.sonar.beams and 0 < LEAST_SHARE * _interval_s(pair) < duration_s
+    duration_s, interval_s = frames.sonar.ping_groups * ping_interval_s(frames.sonar), float(np.median(_intervals_s(frames)))
+    return len(frames.bearing_rad) == frames.sonar.beams and 0 < LEAST_SHARE * interval_s < duration_s
 
 
-def _interval_s(pair: SonarFrames) -> float:
-    time_s = np.asarray(pair.time_s, dtype=float).reshape(len(pair), -1).mean(axis=1)
-    return float(time_s[-1] - time_s[0])
+def _intervals_s(frames: SonarFrames) -> Array:
+    """Return the times from the middle of each frame to that of the next ``(frames - 1,)`` [s]."""
+    return np.diff(np.asarray(frames.time_s, dtype=float).reshape(len(frames), -1).mean(axis=1))
+
+
+def along_path(frames: SonarFrames, poses: Array, height_m: Array) -> SonarFrames:
+    """Return frames as if all beams had pinged in the middle of each frame, given the path; single pings stay as they are.
+
+    Args:
+        frames: frames that follow one another.
+        poses: of the sonar at the middle of each frame ``(frames, 6)`` [m, rad].
+        height_m: over the ground ``(frames,)`` [m].
+    """
+    if not _in_groups(frames):
+        return frames
+    rate = motions(poses) / np.maximum(_intervals_s(frames), 1e-9)[:, None]  # from frame to frame, per second
+    before, after = np.concatenate([rate[:1], rate]), np.concatenate([rate, rate[-1:]])
+    known = replace(frames, height_m=height_m, attitude_rad=poses[:, 3:])
+    return replace(frames, image=_all_moved(known, (before + after) / 2))
 
 
 def at_one_moment(pair: SonarFrames, motion: Motion) -> SonarFrames:
@@ -69,18 +85,25 @@ def at_one_moment(pair: SonarFrames, motion: Motion) -> SonarFrames:
         pair: two frames of a sonar with ping groups.
         motion: motion from the first to the second, which lasts through both.
     """
-    # share of the motion from the middle of the frame to the ping of each beam
-    share = ping_offsets_s(pair.sonar)[group_of_beams(pair.sonar)] / _interval_s(pair)
-    images = np.asarray(pair.image, dtype=np.float32) / (255 if pair.image.dtype == np.uint8 else 1)
-    heights = np.full(len(pair), np.nan) if pair.height_m is None else pair.height_m
-    attitude = pair.attitude_rad if pair.attitude_rad is not None else None if pair.poses is None else pair.poses[:, 3:]
-    pitches = np.zeros(len(pair)) if attitude is None else np.nan_to_num(attitude[:, 0])
-    cone = pair.sonar.bearing == "cone"
+    rate = np.array([motion.sideways, motion.forward, motion.yaw]) / _intervals_s(pair)
+    return replace(pair, image=_all_moved(pair, np.repeat(rate[None], len(pair), axis=0)))
+
+
+def _all_moved(frames: SonarFrames, rate: Array) -> NDArray[np.float32]:
+    """Return the images of frames that move at a rate ``(frames, 3)`` [m/s, m/s, rad/s], with beams moved to the middle."""
+    offset_s = ping_offsets_s(frames.sonar)[group_of_beams(frames.sonar)]  # from the middle of a frame to each beam's ping
+    images = np.asarray(frames.image, dtype=np.float32) / (255 if frames.image.dtype == np.uint8 else 1)
+    heights = np.full(len(frames), np.nan) if frames.height_m is None else frames.height_m
+    attitude = frames.attitude_rad
+    if attitude is None and frames.poses is not None:
+        attitude = frames.poses[:, 3:]
+    pitches = np.zeros(len(frames)) if attitude is None else np.nan_to_num(attitude[:, 0])
+    cone = frames.sonar.bearing == "cone"
     moved = [
-        _moved(image, pair.range_m, pair.bearing_rad, _depth(pair.range_m, *known), share, motion, cone)
-        for image, *known in zip(images, heights, pitches, strict=True)
+        _moved(image, frames.range_m, frames.bearing_rad, _depth(frames.range_m, *known), offset_s, Motion(*speed), cone)
+        for image, speed, *known in zip(images, rate, heights, pitches, strict=True)
     ]
-    return replace(pair, image=np.stack(moved))
+    return np.stack(moved)
 
 
 def _depth(range_m: Array, height_m: float, pitch_rad: float) -> Array:
@@ -95,8 +118,8 @@ def _moved(
     range_m: Array,
     bearing_rad: Array,
     depth_m: Array,
-    share: Array,
-    motion: Motion,
+    offset_s: Array,
+    speed: Motion,
     cone: bool,
 ) -> NDArray[np.float32]:
     """Return an image ``(bins, beams)`` whose beams have moved to the middle of the frame; cells without ground stay."""
@@ -105,9 +128,9 @@ def _moved(
     starboard = (range_m[:, None] if cone else level) * np.sin(bearing_rad)
     square = level**2 - starboard**2
     forward = np.sqrt(np.maximum(square, 0)) * np.where(np.cos(bearing_rad) < 0, -1, 1)
-    sin, cos = np.sin(share * motion.yaw), np.cos(share * motion.yaw)
-    aside = share * motion.sideways + starboard * cos + forward * sin
-    ahead = share * motion.forward - starboard * sin + forward * cos
+    sin, cos = np.sin(offset_s * speed.yaw), np.cos(offset_s * speed.yaw)
+    aside = offset_s * speed.sideways + starboard * cos + forward * sin
+    ahead = offset_s * speed.forward - starboard * sin + forward * cos
     on_ground = (square >= 0) & (level > 0)
     there = np.where(on_ground, np.sqrt(aside**2 + ahead**2 + depth_m[:, None] ** 2), range_m[:, None])
     seen_at = np.arcsin(np.clip(aside / there, -1, 1)) if cone else np.arctan2(aside, ahead)
