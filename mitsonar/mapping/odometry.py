@@ -47,7 +47,7 @@ from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import AXES, assess, in_units, motion_errors, path_length
 from mitsonar.motion.pose import Pose
-from mitsonar.motion.sensors import UNKNOWN_STD, Headings, VehicleSensors, wrapped
+from mitsonar.motion.sensors import UNKNOWN_STD, Headings, VehicleSensors, smoothed_change, wrapped
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
 
@@ -766,6 +766,11 @@ def _path_of(
     poses[:, 2] += 0.0 if rises is None else rises
     moved = relative_motions(solution.poses, np.arange(count - 1), np.arange(1, count))
     motion_covariances = solution.motion_covariances(covariances, following)
+    # headings of the graph are those that the sensors state: with the noise of the roll by which they were corrected
+    if sensors is not None:
+        turn = sensors.turn_std(time_s)
+        motion_covariances[:, 2, 2] += smoothed_change(turn[:-1], turn[1:], np.diff(time_s)) ** 2
+        covariances[:, 2, 2] += smoothed_change(turn[:1], turn, time_s - time_s[0]) ** 2
     last = count - 1
     end = before.columns([last])[last, :2, 0, :2]
     return GraphPath(
@@ -798,6 +803,8 @@ def _graph(
     others, bias, headings = PoseEdges.none(), None, Headings.none()
     if sensors is not None:
         measurements = sensors.motions(measured.time_s)
+        noise = sensors.turn_std(measured.time_s)
+        chain.covariances[:, 2, 2] += smoothed_change(noise[:-1], noise[1:], measured.step_s) ** 2
         chain.covariances[~measured.is_valid & _determined(sensors, measured.time_s)] = np.diag(UNKNOWN_STD**2)
         if measurements:
             pair, motions, covariances, bias = (np.concatenate(parts) for parts in zip(*measurements, strict=True))
