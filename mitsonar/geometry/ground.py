@@ -18,6 +18,7 @@ from mitsonar.instruments.sonar import Bearing, Sonar
 from mitsonar.instruments.views import directions
 from mitsonar.motion.composition import Motion
 from mitsonar.motion.pose import Pose, vehicle_rotation
+from mitsonar.motion.sensors import smoothed_change
 
 if TYPE_CHECKING:
     from mitsonar.records.frames import SonarFrames
@@ -550,6 +551,9 @@ Heave of 4 cm in 3 s, pitch and roll of 2 deg in 2.2 s. Quantities that are not 
 UNKNOWN_MOST = Apart(0.04, math.radians(2.0), math.radians(2.0))
 """Rms difference in height, pitch and roll between frames that are far apart in time."""
 
+USUAL_LEAN_RAD = UNKNOWN_MOST.pitch_rad / math.sqrt(2)
+"""Rms pitch and roll of a vehicle on a calm day: two frames far apart differ by twice the variance of one."""
+
 COARSE = 12
 """Number of ranges and bearings at which the apparent motion of heave, pitch and roll is computed."""
 
@@ -569,7 +573,8 @@ class Attitude:
         given_m: given height over the ground [m]; None if not given.
         first: height from first echoes; None if they do not show it, or contradict the given height.
         apart: deviations of each frame's height, pitch and roll from their mean; empty if unknown or all equal.
-        unsure: standard deviation of their change between the frames; 0 where the change is known.
+        unsure: standard deviation of the error of their change between the frames; 0 where the change is known exactly.
+        mean_unsure: standard deviation of the error of their mean; 0 for the height, which has ``height_std_m``.
     """
 
     height_m: float
@@ -583,6 +588,7 @@ class Attitude:
     first: FirstEchoes | None = None
     apart: tuple[Apart, ...] = ()
     unsure: Apart = NOT_APART
+    mean_unsure: Apart = NOT_APART
 
     @property
     def floor_m(self) -> float:
@@ -656,6 +662,7 @@ def attitude_of(
     if given is not None and not 0 < given < np.inf:
         raise MitsonarError(f"{name} needs a height above 0 m: got {given:g}; give {argument('height_m')}")
     roll = 0.0 if mean_pitch_roll is None else float(mean_pitch_roll[1])
+    change_unsure, mean_unsure = _unsure(frames)
     half = np.radians(frames.sonar.elevation_fov_deg) / 2
     if given is not None and pitch + half > np.pi / 2:
         reason = "the fan extends beyond straight down, where a cell shows two points of the ground"
@@ -663,9 +670,8 @@ def attitude_of(
     if given is not None and relief_m is not None:
         if not given - relief_m > 0:
             raise MitsonarError(f"the height over the visible surface must be above 0: got {given:g} m minus {relief_m:g} m")
-        return Attitude(
-            given - relief_m, STD_MEASURED * given, pitch, roll, apart=_deviations(frames), unsure=_change_std(frames)
-        )
+        level = Attitude(given - relief_m, STD_MEASURED * given, pitch, roll, apart=_deviations(frames))
+        return replace(level, unsure=change_unsure, mean_unsure=mean_unsure)
     heights = echo_heights(frames, pitch, roll)
     if given is None and heights.first is None:
         raise MitsonarError(
@@ -677,7 +683,7 @@ def attitude_of(
         if _rises(heights, given)
         else _over_level(heights.first, given, pitch, roll)
     )
-    return replace(attitude, apart=_deviations(frames), unsure=_change_std(frames))
+    return replace(attitude, apart=_deviations(frames), unsure=change_unsure, mean_unsure=mean_unsure)
 
 
 def _rises(heights: EchoHeights, given_m: float | None) -> bool:
@@ -740,11 +746,12 @@ def _deviations(frames: SonarFrames) -> tuple[Apart, ...]:
     )
 
 
-def _change_std(frames: SonarFrames) -> Apart:
-    """Return the standard deviation of the unmeasured changes of height, pitch and roll between the frames.
+def _unsure(frames: SonarFrames) -> tuple[Apart, Apart]:
+    """Return the standard deviations of the changes of height, pitch and roll between the frames, and of their mean.
 
-    A pitch and roll that are the same in all frames do not count as a measurement of their change, unless heights are known
-    and no attitude is marked as unknown.
+    This is the noise of a vehicle's sensors, and where none measured a change, the change that is usual on a calm day, or
+    that ``attitude_std`` of the frames states. A pitch and roll that are the same in all frames do not count as a
+    measurement of their change, unless heights are known and no attitude is marked as unknown.
     """
     time_s = frames.time_s if frames.time_s.ndim == 1 else frames.time_s.mean(axis=1)
     step_s = abs(float(time_s[-1] - time_s[0]))
@@ -754,8 +761,17 @@ def _change_std(frames: SonarFrames) -> Apart:
     lean_known = pitch_roll is not None and (
         (heave_known and not marked) or bool((np.abs(pitch_roll - pitch_roll[0]) > MIN_CHANGE).any())
     )
-    rates = zip(UNKNOWN_PER_S, UNKNOWN_MOST, (heave_known, lean_known, lean_known), strict=True)
-    return Apart(*(0.0 if known else min(rate * step_s, most) for rate, most, known in rates))
+    noise = np.zeros((2, 3)) if frames.attitude_std is None else frames.attitude_std[[0, -1]]
+    measured = smoothed_change(noise[0], noise[1], step_s).tolist()
+    known = heave_known, lean_known, lean_known
+    # a vehicle that leans more than on a calm day also leans faster
+    rough = 1.0, *(1.0 if lean_known else max(1.0, float(std / USUAL_LEAN_RAD)) for std in noise[0, 1:])
+    usual = [
+        factor * min(rate * step_s, most) for factor, rate, most in zip(rough, UNKNOWN_PER_S, UNKNOWN_MOST, strict=True)
+    ]
+    change = Apart(*(std if is_known else other for std, other, is_known in zip(measured, usual, known, strict=True)))
+    mean = NOT_APART if lean_known else Apart(0.0, *(factor * USUAL_LEAN_RAD for factor in rough[1:]))
+    return change, mean
 
 
 def _pitch_roll(frames: SonarFrames) -> NDArray[np.float64] | None:

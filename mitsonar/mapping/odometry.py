@@ -15,10 +15,12 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from statistics import median_low
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
 
 from mitsonar.errors import MitsonarError, argument, count_noun, suggest_names
 from mitsonar.estimation.estimator import FROM_PRIOR, AnyEstimator, Estimate
@@ -27,7 +29,7 @@ from mitsonar.mapping.local_map import USED, map_attitudes, mapped
 from mitsonar.mapping.loops import Canvas, LoopSearch, canvas_of, search_loops
 from mitsonar.mapping.open_source import Source
 from mitsonar.mapping.pairs import EstimateStore, continued, estimate_motions
-from mitsonar.mapping.pose_graph import GraphSolution, PoseEdges, PoseGraph, relative_motions, solved
+from mitsonar.mapping.pose_graph import OUTLIER, GraphSolution, PoseEdges, PoseGraph, relative_motions, solved
 from mitsonar.mapping.series import (
     CorrelatedErrors,
     ErrorCorrelation,
@@ -45,7 +47,7 @@ from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import AXES, assess, in_units, motion_errors, path_length
 from mitsonar.motion.pose import Pose
-from mitsonar.motion.sensors import UNKNOWN_STD, Headings, VehicleSensors, wrapped
+from mitsonar.motion.sensors import UNKNOWN_STD, Headings, VehicleSensors, smoothed_change, wrapped
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
 
@@ -350,6 +352,7 @@ class Odometry:
         if self.closure is not None:
             over = f"closure over {self.closure.steps} motions"
             rows.append((f"{over}, loops", len(self.closure.residuals), ""))
+            rows += [(f"{over}, loops refused", self.closure.refused, "")] if self.closure.refused else []
             rows += _by_axis(f"{over}, rms", in_units(self.closure.rms))
             rows += _by_axis(f"{over}, mean", in_units(self.closure.mean))
         true = self.true_at_frames
@@ -431,6 +434,9 @@ def series_of(estimates: list[Estimate], time_s: ArrayLike) -> MotionSeries:
 FEWEST = 2
 """Smallest number of loops from which errors are estimated."""
 
+USUAL = float(chi2.median(3))
+"""Median of the squared normalised residual of a loop whose covariances are right."""
+
 
 @dataclass(frozen=True)
 class Closure:
@@ -441,11 +447,13 @@ class Closure:
         residuals: residual of each loop ``(loops, 3)``: sideways, forward [m], yaw [rad].
         factor: factor by which the covariances of the single motions must be multiplied to explain the residuals; at least
             1. nan if the covariances are not known.
+        refused: number of loops left out, whose motion over all steps is a wrong match.
     """
 
     steps: int
     residuals: Array
     factor: float
+    refused: int = 0
 
     @property
     def rms(self) -> Array:
@@ -480,7 +488,9 @@ def closure_of(
     """Compare composed single motions with motions that are estimated over several steps at once.
 
     Loops follow one another without overlap, so that their errors are independent. In a short run they overlap, to give
-    up to 16 loops.
+    up to 16 loops. A motion over all steps is refused if its match is not distinct, or if it contradicts the single motions
+    as one in 1,000 right ones would: beyond the stated covariances, and beyond those that explain the median loop. So one
+    wrong match counts for nothing, and covariances that are too small for most loops still show.
 
     Args:
         source: source of the records.
@@ -491,10 +501,10 @@ def closure_of(
         progress: called with the number of loops processed, including those that are skipped.
 
     Returns:
-        The closure; None if fewer than two loops have valid motions throughout.
+        The closure; None if fewer than two loops have valid motions throughout and are not refused.
     """
     valid = np.array([one.valid for one in estimates], dtype=bool)
-    residuals, explained = [], []
+    residuals, squared, refused = [], [], 0
     for start in (int(one) for one in loop_starts(len(estimates), steps)):
         # a loop with an invalid single motion has no composition to compare
         if not valid[start : start + steps].all():
@@ -506,19 +516,25 @@ def closure_of(
         progress(1)
         if not whole.valid:
             continue
+        if not whole.about.get("distinct", True):  # light that moves with the sonar matches at any motion
+            refused += 1
+            continue
         # residual: composed motion minus direct motion
         parts = list(estimates[start : start + steps])
         residual = _composed(np.array([one.motion for one in parts])) - np.asarray(whole.motion)
         residuals.append(residual)
-        # normalised squared residual per degree of freedom: 1 on average if the covariances are right
+        # squared residual normalised by its covariance: 3 on average if the covariances are right
         covariances = [one.covariance for one in (*parts, whole) if one.covariance is not None]
-        if len(covariances) == steps + 1:
-            total = np.sum(np.array(covariances), axis=0)
-            explained.append(float(residual @ np.linalg.solve(total, residual)) / 3)
-    if len(residuals) < FEWEST:
+        total = np.sum(np.array(covariances), axis=0) if len(covariances) == steps + 1 else np.full((3, 3), np.nan)
+        squared.append(float(residual @ np.linalg.solve(total, residual)))
+    # the lower of two medians: of two loops that contradict each other, only the one nearer to the path remains
+    scale = max(1.0, median_low(squared) / USUAL) if squared else 1.0
+    agree = ~(np.array(squared) > OUTLIER * scale)  # nan without covariances, where no loop is refused
+    refused += len(agree) - int(agree.sum())
+    if agree.sum() < FEWEST:
         return None
-    factor = max(1.0, float(np.mean(explained))) if len(explained) == len(residuals) else float("nan")
-    return Closure(steps, np.array(residuals), factor)
+    factor = float(np.mean(np.array(squared)[agree])) / 3
+    return Closure(steps, np.array(residuals)[agree], factor if np.isnan(factor) else max(1.0, factor), refused)
 
 
 def loop_starts(motions: int, steps: int) -> Index:
@@ -750,6 +766,11 @@ def _path_of(
     poses[:, 2] += 0.0 if rises is None else rises
     moved = relative_motions(solution.poses, np.arange(count - 1), np.arange(1, count))
     motion_covariances = solution.motion_covariances(covariances, following)
+    # headings of the graph are those that the sensors state: with the noise of the roll by which they were corrected
+    if sensors is not None:
+        turn = sensors.turn_std(time_s)
+        motion_covariances[:, 2, 2] += smoothed_change(turn[:-1], turn[1:], np.diff(time_s)) ** 2
+        covariances[:, 2, 2] += smoothed_change(turn[:1], turn, time_s - time_s[0]) ** 2
     last = count - 1
     end = before.columns([last])[last, :2, 0, :2]
     return GraphPath(
@@ -782,6 +803,8 @@ def _graph(
     others, bias, headings = PoseEdges.none(), None, Headings.none()
     if sensors is not None:
         measurements = sensors.motions(measured.time_s)
+        noise = sensors.turn_std(measured.time_s)
+        chain.covariances[:, 2, 2] += smoothed_change(noise[:-1], noise[1:], measured.step_s) ** 2
         chain.covariances[~measured.is_valid & _determined(sensors, measured.time_s)] = np.diag(UNKNOWN_STD**2)
         if measurements:
             pair, motions, covariances, bias = (np.concatenate(parts) for parts in zip(*measurements, strict=True))

@@ -23,11 +23,12 @@ from scipy.spatial.transform import Slerp
 from mitsonar.acoustics.levels import LocalContrast, fitted_contrast
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError, MitsonarWarning, argument, count_noun, suggest_names
+from mitsonar.geometry.ground import UNKNOWN_PER_S, USUAL_LEAN_RAD
 from mitsonar.io.files import missing_file
 from mitsonar.io.runs import kind_of_run
 from mitsonar.motion.errors import associated
 from mitsonar.motion.pose import poses_from, vehicle_rotation
-from mitsonar.motion.sensors import VehicleSensors, leaning_mount
+from mitsonar.motion.sensors import VehicleSensors, leaning_mount, smoothed_change
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.recordings.recording import CHUNK_BYTES, Part, Pixels, Recording
 from mitsonar.records.frames import COLUMNS, LABELS, PER_FRAME, SonarFrames, check_column, open_group, to_float32
@@ -85,6 +86,8 @@ class FrameSource:
         pitch_rad: pitch of the sonar [rad], if its poses are not known.
         given_height_m: height that the user gave for frames without one [m].
         rise_m: rise of each frame above the first, from a depth sensor ``(frames,)`` [m], if known and poses are not.
+        attitude_std: standard deviations of the height [m], pitch and roll [rad] of each frame by a vehicle's sensors
+            ``(frames, 3)``: their noise, or if they measure only depth, the lean that goes with the heave. None: not known.
         assumed_height: whether ``height_m`` is an assumption, because neither the frames nor the user give a height.
         noise: noise added to the frames when they are read.
         seed: seed of the noise.
@@ -105,6 +108,7 @@ class FrameSource:
     pitch_rad: float | None = None
     given_height_m: float | None = None
     rise_m: Array | None = None
+    attitude_std: Array | None = None
     assumed_height: bool = False
     noise: NoiseModel | None = None
     seed: int = 0
@@ -254,12 +258,15 @@ class FrameSource:
                     MitsonarWarning,
                     stacklevel=3,
                 )
-        lean, aided = sensors.attitudes(self.time_s), self
+        lean, aided, std = sensors.attitudes(self.time_s), self, sensors.attitude_std(self.time_s)
         if self.poses is None and (rise := sensors.rises(self.time_s)) is not None:
             heights = self.height_m
             if heights is not None and np.ptp(heights) == 0:
                 heights = heights + rise - rise.mean()
-            aided = replace(self, rise_m=rise, height_m=heights)
+            # the attitude is unknown; a vehicle that heaves faster than on a calm day also leans more
+            usual = max(1.0, _heave_rate(self.time_s, rise, std[:, 0]) / UNKNOWN_PER_S.height_m) * USUAL_LEAN_RAD
+            leans = np.column_stack([std[:, 0], np.full((len(self), 2), usual * (self.pitch_rad is not None))])
+            aided = replace(self, rise_m=rise, height_m=heights, attitude_std=leans)
         if lean is None:
             return aided, sensors
         known = self.attitudes(np.arange(len(self)))
@@ -269,7 +276,9 @@ class FrameSource:
                 f"known: give {argument('pitch_rad')}, 0 for a sonar that looks straight ahead"
             )
         if self.poses is None and self.pitch_rad is not None:
-            aided = replace(aided, attitude_rad=leaning_mount(lean, self.pitch_rad), pitch_rad=None)
+            on_mount = std / [1, 1, np.cos(self.pitch_rad)] * [aided.rise_m is not None, 1, 1]
+            lean = leaning_mount(lean, self.pitch_rad)
+            aided = replace(aided, attitude_rad=lean, pitch_rad=None, attitude_std=on_mount)
             return aided, sensors.on_mount(self.pitch_rad)
         return aided, sensors.on_mount(float(np.nanmean(known[:, 3] - lean[:, 0])))
 
@@ -330,6 +339,7 @@ class FrameSource:
             poses=poses,
             attitude_rad=np.full((len(chosen), 3), np.nan) if unmeasured else None,
             height_m=None if self.height_m is None else self.height_m[chosen],
+            attitude_std=None if self.attitude_std is None else self.attitude_std[chosen],
         )
         if self.altimeter is not None:
             frames = measured(frames, self.altimeter)[0]
@@ -402,6 +412,14 @@ class FrameSource:
             some = np.unique(np.linspace(0, len(self) - 1, 3).astype(np.intp))
             digest.update(np.ascontiguousarray(self.read(some).image).tobytes())
         return digest.hexdigest()
+
+
+def _heave_rate(time_s: Array, rise_m: Array, std_m: Array) -> float:
+    """Return the rms rate of the heave [m/s] without its noise; dives for less than half the time do not count."""
+    step = np.diff(time_s)
+    rate, noise = np.diff(rise_m) / step, smoothed_change(std_m[:-1], std_m[1:], step) / step
+    # half of a sway's squares lie below their mean
+    return float(np.sqrt(max(0.0, float(np.median((rate - np.median(rate)) ** 2 - noise**2)))))
 
 
 # ---------------- Frames at a path or URL

@@ -35,6 +35,7 @@ __all__ = [
     "leaning_mount",
     "load_sensors",
     "save_sensors",
+    "smoothed_change",
     "straight_poses",
     "wrapped",
 ]
@@ -60,6 +61,12 @@ SMOOTHED_MARGIN_S = 10.0
 
 FEWEST_SMOOTHED = 5
 """Fewest readings that are smoothed; fewer are interpolated."""
+
+REMAINING = 3 / 2**3.5
+"""Variance of a smoothed value over that of a reading, times :data:`SMOOTHED_S` over the time between readings.
+
+The smoothing spline has the frequency response ``1 / (1 + w**4)``, whose square integrates to this over ``2 pi``.
+"""
 
 SLOWER = 3.0
 """Number of median steps beyond which a step counts as a gap."""
@@ -182,10 +189,38 @@ class Readings:
         if len(values) < FEWEST_SMOOTHED:
             return np.asarray(between)
         spline = make_smoothing_spline(seconds, values, lam=SMOOTHED_S**4 / float(np.median(np.diff(seconds))))
-        smooth = spline(np.clip(time_s - time_s[0], seconds[0], seconds[-1]))
+        smooth = spline(time_s - time_s[0])
         # a spline swings far out between readings that lie far apart
         after = np.clip(np.searchsorted(seconds, time_s - time_s[0]), 1, len(seconds) - 1)
         return np.where(np.diff(seconds)[after - 1] > LONGEST_GAP_S, between, smooth)
+
+    def smoothed_std(self, time_s: Array) -> Array:
+        """Return the standard deviations of :meth:`smoothed` by the noise of the readings ``(times,)``.
+
+        They hold for even steps. At the first and the last reading, with readings on one side only, they are twice as large.
+        """
+        std = np.interp(time_s, self.time_s, self.std)
+        if len(self.values) < FEWEST_SMOOTHED:
+            return np.asarray(std)
+        from_end = np.minimum(time_s - self.time_s[0], self.time_s[-1] - time_s)
+        one_sided = 1 + 3 * np.exp(-2 * from_end / SMOOTHED_S)
+        step = float(np.median(np.diff(self.time_s)))
+        return np.asarray(std * np.sqrt(np.minimum(1.0, REMAINING * step / SMOOTHED_S * one_sided)))
+
+
+def smoothed_change(first: Array, second: Array, step_s: float | Array) -> Array:
+    """Return the standard deviation of the change between two smoothed values by the noise of the readings.
+
+    The errors of values that lie within the time of smoothing are correlated: by the autocorrelation of a spline's kernel.
+
+    Args:
+        first: standard deviations of the earlier values, from :meth:`Readings.smoothed_std`.
+        second: those of the later values.
+        step_s: time between the two [s].
+    """
+    lag = np.abs(step_s) / (np.sqrt(2) * SMOOTHED_S)
+    correlation = np.exp(-lag) * (np.cos(lag) + (1 + 2 * lag / 3) * np.sin(lag))
+    return np.asarray(np.sqrt(np.maximum(first**2 + second**2 - 2 * correlation * first * second, 0.0)))
 
 
 def _integrate_between(edges: Array, rate: Array, time_s: Array) -> Array:
@@ -274,6 +309,7 @@ class VehicleSensors:
         dead_reckoning: poses from other navigation.
         bias_std: standard deviation of the constant gyroscope bias [rad/s]; 0 for none.
         name: name of the source in messages.
+        mount_rad: pitch of the mount for which :meth:`on_mount` has corrected turns for the roll, whose noise they share.
 
     Raises:
         MitsonarError: no sensor at all, a pitch without roll or the reverse, or a negative bias.
@@ -289,6 +325,7 @@ class VehicleSensors:
     name: str = "the sensors"
     pitch: Readings | None = None
     roll: Readings | None = None
+    mount_rad: float = 0.0
 
     def __post_init__(self) -> None:
         if (self.pitch is None) != (self.roll is None):
@@ -362,11 +399,11 @@ class VehicleSensors:
             return self
 
         def turn(time_s: Array) -> Array:
-            lean = self.attitudes(np.clip(time_s, pitch.time_s[0], pitch.time_s[-1]))
+            lean = self.attitudes(np.clip(time_s, *pitch.edges_s[[0, -1]]))
             assert lean is not None
             return leaning_mount(lean, pitch_rad)[:, 2]
 
-        changes: dict[str, Readings | DeadReckoning] = {}
+        changes: dict[str, Readings | DeadReckoning | float] = {"mount_rad": pitch_rad}
         if (gyro := self.yaw_rate) is not None:
             rate = np.diff(turn(gyro.edges_s)) / np.diff(gyro.edges_s)
             changes["yaw_rate"] = replace(gyro, values=gyro.values + rate)
@@ -405,6 +442,14 @@ class VehicleSensors:
             yield self._dvl_motions(time_s)
         if self.dead_reckoning is not None:
             yield _reckoning_motions(self.dead_reckoning, time_s)
+
+    def turn_std(self, time_s: Array) -> Array:
+        """Return the standard deviation of the turns by which :meth:`on_mount` corrects headings ``(frames,)`` [rad].
+
+        It is the noise of the roll. The error of a frame's turn enters the yaws before and after it with opposite signs, so
+        that it does not add up along a path: :meth:`motions` leave it out.
+        """
+        return np.asarray(np.tan(self.mount_rad) * self.attitude_std(time_s)[:, 2])
 
     def _gyro_motions(self, gyro: Readings, time_s: Array) -> SensorMotions:
         """Return the yaw measured by the gyroscope."""
@@ -468,8 +513,11 @@ class VehicleSensors:
         # Weight each sensor by its information, starting from a weak prior, so that the result is always defined.
         information = np.tile(np.diag(1 / UNKNOWN_STD**2), (len(time_s) - 1, 1, 1))
         weighted = np.zeros((len(time_s) - 1, 3, 1))
+        turn = self.turn_std(time_s)
+        turn_noise = smoothed_change(turn[:-1], turn[1:], np.diff(time_s))[:, None, None] ** 2 * np.diag([0.0, 0.0, 1.0])
         for measurement in measurements:
-            inverse = _inverse(measurement.covariances + measurement.bias[:, :, None] * measurement.bias[:, None])
+            by_bias = measurement.bias[:, :, None] * measurement.bias[:, None]
+            inverse = _inverse(measurement.covariances + by_bias + turn_noise[measurement.pair])
             information[measurement.pair] += inverse
             weighted[measurement.pair] += inverse @ measurement.motions[..., None]
         covariances = _inverse(information)
@@ -503,6 +551,15 @@ class VehicleSensors:
             return None
         pitch, roll = self.pitch.smoothed(time_s), self.roll.smoothed(time_s)
         return None if pitch is None or roll is None else np.column_stack([pitch, roll])
+
+    def attitude_std(self, time_s: Array) -> Array:
+        """Return standard deviations of smoothed depth [m], pitch and roll [rad] of the vehicle ``(frames, 3)``; 0 without.
+
+        They hold the noise of the readings. :func:`smoothed_change` gives those of the change between two frames.
+        """
+        none = np.zeros(len(time_s))
+        readings = self.depth, self.pitch, self.roll
+        return np.column_stack([none if one is None else one.smoothed_std(time_s) for one in readings])
 
 
 def _inverse(matrices: Array) -> Array:

@@ -328,7 +328,7 @@ LABELS = {"elevation_rad": np.float32, "shape_id": np.int32, "object_id": np.int
 
 BODIES = ("body_poses", "body_velocities")
 
-PER_FRAME = ("image", "time_s", "poses", "beam_poses", *BODIES, "attitude_rad", "height_m", *LABELS)
+PER_FRAME = ("image", "time_s", "poses", "beam_poses", *BODIES, "attitude_rad", "attitude_std", "height_m", *LABELS)
 
 IMAGE = ("frames", "bins", "beams")
 
@@ -380,6 +380,8 @@ class SonarFrames:
             of the beam was intercepted at shorter range (an object's shadow that extends to the end, or past the lit floor).
         attitude_rad: pitch, roll, heading [rad] from the sonar's own sensors ``(frames, 3)``; nan where unknown.
         about: further metadata that can be stored as JSON.
+        attitude_std: standard deviations of the height [m], pitch and roll [rad] in ``poses`` by a vehicle's sensors
+            ``(frames, 3)``; not stored.
     """
 
     image: NDArray[Any]
@@ -403,6 +405,7 @@ class SonarFrames:
     body_velocities: NDArray[np.float64] | None = None
     body_names: tuple[str, ...] = ()
     about: dict[str, Any] = field(default_factory=dict)
+    attitude_std: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         frames, bins, beams = self.image.shape if self.image.ndim == 3 else (0, 0, 0)

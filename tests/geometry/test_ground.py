@@ -180,6 +180,44 @@ def test_unknown_heave_pitch_and_roll_widen_by_what_they_look_like(axis: int, ch
         assert error @ np.linalg.solve(known.covariance, error) > 5
 
 
+@pytest.mark.parametrize(("axis", "change"), [(2, 0.002), (4, np.radians(0.1))])
+def test_noise_of_sensors_widens_by_what_it_moves(axis: int, change: float) -> None:
+    """Two routes: an error of one height or roll moves the estimate; its variance adds the square of that."""
+    poses = np.tile([0.0, 0.0, 2.5, np.radians(35), 0.0, 0.0], (2, 1))
+    poses[1, 1] = 0.02
+    sonar = load_sonar("didson300").replace(model="physical")
+    frames, estimator = over_ground(Trajectory(poses, np.array([0.0, 10.0])), sonar), create_estimator("direct")
+    off = [poses + sign * change * np.outer([0, 1], np.eye(6)[axis]) for sign in (-1, 1)]
+    low, high = (np.array(estimator.estimate(replace(frames, poses=one)).motion) for one in off)
+    # 10 s apart, the errors of both frames are independent, so that each has half the variance of the change
+    std = np.tile(change / np.sqrt(2) * np.eye(3)[axis - 2], (2, 1))
+    plain, noisy = (estimator.estimate(replace(frames, attitude_std=one)).covariance for one in (None, std))
+    assert plain is not None
+    assert noisy is not None
+    moved_by = (high - low) / 2
+    scale = np.sqrt(np.diag(plain))
+    grown, expected = (noisy - plain) / np.outer(scale, scale), np.outer(moved_by / scale, moved_by / scale)
+    np.testing.assert_allclose(grown, expected, atol=0.15 * expected.max())
+    assert expected.max() > 2
+
+
+def test_an_unknown_roll_turns_the_motion() -> None:
+    """A roll of 1.4 deg that is taken as 0 shifts ground ahead sideways; covariances hold it only if it is unknown."""
+    poses = np.tile([0.0, 0.0, 2.5, np.radians(35), np.radians(1.4), 0.0], (2, 1))
+    poses[1, 1] = 0.08
+    sonar = load_sonar("didson300").replace(model="physical")
+    frames, estimator = over_ground(Trajectory(poses, np.array([0.0, 0.1])), sonar), create_estimator("direct")
+    level = poses * [1, 1, 1, 1, 0, 1]
+    known, wrong = (estimator.estimate(replace(frames, poses=one)) for one in (poses, level))
+    unknown = estimator.estimate(replace(frames, poses=level * [1, 1, np.nan, 1, 1, 1]))
+    error = np.array(unknown.motion) - np.array(known.motion)
+    np.testing.assert_allclose(unknown.motion, wrong.motion, atol=1e-6)
+    assert unknown.covariance is not None
+    assert wrong.covariance is not None
+    assert error @ np.linalg.solve(wrong.covariance, error) > 5
+    assert error @ np.linalg.solve(unknown.covariance, error) < 3
+
+
 def test_heave_looks_like_a_step_along_the_grazing_ray() -> None:
     """Of a single range and a single beam, in closed form: d forward = -h / x d height."""
     narrow = GroundGeometry(np.array([4.0, 4.001]), np.array([-1e-6, 1e-6]), "azimuth", 2.4, np.radians(35))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -34,7 +34,8 @@ class Known:
     """Tells the true motion with errors: Gaussian ones of ``std``, independent of the length, and a ``pull`` towards rest.
 
     The pull is a part of motions of one step; over several steps there is none, as with light that moves with a sonar.
-    Motions over more than ``farthest`` steps are rejected.
+    Motions over more than ``farthest`` steps are rejected. Those over several steps from the frames in ``wrong`` are matched
+    where they do not belong, 0.3 m off; ``distinct`` is what they report of themselves.
     """
 
     poses: NDArray[np.float64]
@@ -43,6 +44,8 @@ class Known:
     pull: float = 0.0
     lost: tuple[int, ...] = ()
     farthest: int = FRAMES
+    wrong: tuple[int, ...] = ()
+    distinct: bool = True
 
     consumes = SonarFrames
     inputs = "nothing"
@@ -52,7 +55,11 @@ class Known:
         first, second = (int(number) for number in frames.image[:, 0, 0])
         answer = motions(self.poses[[first, second]])[0] * (1 - self.pull * (second - first == 1))
         answer = answer + np.random.default_rng([first, second]).normal(0, self.std)
-        return Estimate(Motion(*answer), None if self.told is None else np.diag(self.told**2), self._valid(first, second))
+        wrong = first in self.wrong and second - first > 1
+        answer = answer - [0.0, 0.3 * wrong, 0.0]
+        covariance = None if self.told is None else np.diag(self.told**2)
+        about = {"distinct": self.distinct or not wrong}
+        return Estimate(Motion(*answer), covariance, self._valid(first, second), about=about)
 
     def _valid(self, first: int, second: int) -> bool:
         return first not in self.lost and second - first <= self.farthest
@@ -114,6 +121,38 @@ def test_loops_with_invalid_motions_are_left_out_and_one_loop_is_none() -> None:
     source, numbers = FrameSource.of(short), np.arange(STEPS + 1)
     known = Known(short.poses, np.zeros(3), STD)
     assert closure_of(source, known, numbers, estimate_motions(source, known, numbers), STEPS) is None
+
+
+@pytest.mark.parametrize("small", [1, 5])
+def test_a_wrong_match_is_refused_and_right_ones_still_show_covariances_that_are_too_small(small: int) -> None:
+    """A loop of 0.3 m in 200 is left out; the others have the factor of the path without it, 1 or 25."""
+    frames = numbered(1601)
+    assert frames.poses is not None
+    right = Known(frames.poses, STD, STD / small)
+    (plain, _), (result, _) = closed(right, frames), closed(replace(right, wrong=(80,)), frames)
+    assert result.factor == pytest.approx(small**2, rel=0.25)
+    assert plain.refused <= 1  # of 200 right loops
+    assert result.refused == plain.refused + 1
+    assert np.abs(result.residuals).max() == np.abs(plain.residuals).max()
+    # a path that drifts by far more than it states is believed to do so: its loops agree
+    drifting, _ = closed(replace(right, pull=0.1), frames)
+    assert drifting.refused <= 1
+    assert drifting.factor > 10
+    # most matches are wrong: they agree on a place, and only a match that is not distinct is known to be wrong
+    many = tuple(range(0, 1200, STEPS))
+    indistinct, _ = closed(replace(right, wrong=many, distinct=False), frames)
+    assert indistinct.refused == len(many)
+    np.testing.assert_array_equal(indistinct.residuals[-10:], plain.residuals[-10:])
+
+
+def test_of_two_loops_that_contradict_each_other_none_counts() -> None:
+    frames = numbered(STEPS + 2)
+    assert frames.poses is not None
+    source, numbers = FrameSource.of(frames), np.arange(STEPS + 2)
+    for wrong, found in (((), 2), ((1,), None)):
+        known = Known(frames.poses, STD, STD, wrong=wrong)
+        result = closure_of(source, known, numbers, estimate_motions(source, known, numbers), STEPS)
+        assert (None if result is None else len(result.residuals)) == found
 
 
 def test_odometry_tells_the_closure_and_raises_its_covariances() -> None:

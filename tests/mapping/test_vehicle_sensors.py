@@ -10,16 +10,26 @@ import numpy as np
 import pytest
 from drawn_frames import over_ground, sway
 from numpy.typing import NDArray
+from scipy.interpolate import make_smoothing_spline
 
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import Estimate, prior_rejection
-from mitsonar.geometry.ground import attitude_of
-from mitsonar.mapping.odometry import contradiction
+from mitsonar.geometry.ground import UNKNOWN_PER_S, USUAL_LEAN_RAD, attitude_of
+from mitsonar.mapping.odometry import contradiction, graph_path
 from mitsonar.mapping.sensors import SensorNoise, open_sensors, simulated_sensors
+from mitsonar.mapping.series import MotionSeries
 from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.pose import Pose, mounted
-from mitsonar.motion.sensors import ROOT_HOUR, SMOOTHED_S, Readings, VehicleSensors, load_sensors, save_sensors
+from mitsonar.motion.sensors import (
+    ROOT_HOUR,
+    SMOOTHED_S,
+    Readings,
+    VehicleSensors,
+    load_sensors,
+    save_sensors,
+    smoothed_change,
+)
 from mitsonar.motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -104,9 +114,48 @@ def test_frames_take_height_and_attitude_from_the_sensors_of_a_vehicle() -> None
     # a depth sensor alone measures the heave, and leaves pitch and roll unknown
     heaving, _ = source.with_geometry(2.2, np.radians(25)).with_sensors(deep)
     unsure = attitude_of(heaving.read([3, 4]), "direct", None, None).unsure
-    assert unsure.height_m == 0
-    assert min(unsure.pitch_rad, unsure.roll_rad) > 0
-    assert not any(attitude_of(aided.read([3, 4]), "direct", None, None).unsure)
+    assert unsure.height_m < 1e-9
+    assert min(unsure.pitch_rad, unsure.roll_rad) > np.radians(0.5)
+    # it heaves 0.11 m/s rms, faster than on a calm day, and so may lean more
+    assert heaving.attitude_std is not None
+    faster = 0.1 * 2 * np.pi / 4 / np.sqrt(2) / UNKNOWN_PER_S.height_m
+    np.testing.assert_allclose(heaving.attitude_std[:, 1:], faster * USUAL_LEAN_RAD, rtol=0.2)
+    lean = attitude_of(heaving.read([3, 4]), "direct", None, None).mean_unsure
+    assert lean == pytest.approx((0, *heaving.attitude_std[3, 1:]))
+    assert max(attitude_of(aided.read([3, 4]), "direct", None, None).unsure) < 1e-9
+    # the noise of readings reaches what is unsure of a pair: after smoothing, in the axes of the sonar
+    coarse = simulated_sensors(vehicle, SensorNoise(depth_m=0.01, attitude_deg=0.1, rate_hz=20.0))
+    noisy, _ = source.with_geometry(2.2, np.radians(25)).with_sensors(coarse)
+    unsure = attitude_of(noisy.read([20, 21]), "direct", None, None).unsure
+    expected = np.array([0.01, np.radians(0.1), np.radians(0.1) / np.cos(np.radians(25))])
+    np.testing.assert_allclose(unsure, 0.2135 * expected, rtol=1e-3)
+
+
+def test_smoothed_noise_has_the_variance_of_the_smoothing_matrix() -> None:
+    """Two routes: the closed form of the spline's kernel, and the matrix that maps readings to smoothed values."""
+    step, time = 0.05, np.arange(0, 10.01, 0.05)
+    matrix = make_smoothing_spline(time, np.eye(len(time)), lam=SMOOTHED_S**4 / step)
+    seen = readings(time, np.zeros(len(time)), 0.01)
+    at = np.array([0.0, 0.1, 0.3, 5.0, 5.2, 5.4, 6.0, 9.9, 10.0])
+    by_matrix = 0.01 * np.linalg.norm(matrix(at), axis=1)
+    np.testing.assert_allclose(seen.smoothed_std(at)[3:7], by_matrix[3:7], rtol=1e-4)
+    np.testing.assert_allclose(seen.smoothed_std(at), by_matrix, rtol=0.1)  # near the ends by a fit
+    middle = seen.smoothed_std(at[3:7])
+    for k in range(1, 4):
+        change = 0.01 * np.linalg.norm(matrix(at[3 + k]) - matrix(at[3]))
+        assert smoothed_change(middle[0], middle[k], at[3 + k] - at[3]) == pytest.approx(change, rel=1e-3)
+
+
+def test_turns_corrected_for_the_roll_state_its_noise() -> None:
+    """Errors of the yaws of 20 dives over their variance; without the noise of the roll they would be 20 times as large."""
+    vehicle, sonar = rolling()
+    true, squared = motions(sonar.poses)[:, 2], []
+    for seed in range(20):
+        seen = simulated_sensors(vehicle, SensorNoise(0.3, attitude_deg=0.1), seed).on_mount(np.radians(25))
+        priors = seen.priors(vehicle.time_s)
+        assert priors is not None
+        squared.append([(one.motion.yaw - yaw) ** 2 / one.covariance[2, 2] for one, yaw in zip(priors, true, strict=True)])
+    assert np.mean(squared) == pytest.approx(1, abs=0.25)
 
 
 def test_smoothing_takes_noise_out_and_little_of_a_sway() -> None:
@@ -130,6 +179,25 @@ def test_smoothing_takes_noise_out_and_little_of_a_sway() -> None:
     constant = readings(time, np.full(len(time), 3.0), 0.01).smoothed(frames)
     assert constant is not None
     np.testing.assert_allclose(constant, 3, rtol=1e-9)
+
+
+def test_the_noise_of_the_roll_is_in_each_motion_and_does_not_add_up() -> None:
+    """Yaws and the last heading of the paths of 40 dives, over their variances."""
+    vehicle, sonar = rolling()
+    true, std = motions(sonar.poses), np.array([2e-3, 1e-3, 1e-3])
+    squared = []
+    for seed in range(40):
+        seen = simulated_sensors(vehicle, SensorNoise(0.05, attitude_deg=0.2), seed).on_mount(np.radians(25))
+        drawn = true + std * np.random.default_rng(seed).normal(size=true.shape)
+        measured = MotionSeries(drawn, sonar.time_s, np.tile(np.diag(std**2), (len(true), 1, 1)))
+        start = Pose.from_row(sonar.poses[0])
+        found = graph_path(measured, start, start_known=True, sensors=seen, search=None, source=None)
+        assert found.series.covariances is not None
+        yaws = (found.series.motions[:, 2] - true[:, 2]) ** 2 / found.series.covariances[:, 2, 2]
+        end = (found.path.poses[-1, 5] - sonar.poses[-1, 5]) ** 2 / found.covariances[-1, 2, 2]
+        squared.append((yaws.mean(), end))
+    # added up as if independent, the noise of 40 yaws would make the variance of the last heading ten times as large
+    np.testing.assert_allclose(np.mean(squared, axis=0), 1, atol=0.35)
 
 
 def test_a_gyroscope_s_noise_grows_with_the_root_of_time() -> None:

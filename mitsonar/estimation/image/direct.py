@@ -305,7 +305,8 @@ class Direct:
         covariance = model * fit.covariance[:3, :3] + np.outer(by_height, by_height)
         motion = Motion(*(float(x) for x in v))
         reason = _rejection(fit, covariance, v - np.array(start))
-        by_lean = fit.by_lean[:3] * task.attitude.unsure * ([0, 1, 1] if self.heave_std_m else [1, 1, 1])
+        unsure = np.array([*task.attitude.unsure, *task.attitude.mean_unsure[1:]])
+        by_lean = fit.by_lean[:3] * unsure * ([0, 1, 1, 1, 1] if self.heave_std_m else 1)
         covariance = covariance + by_lean @ by_lean.T
         reason = reason or prior_rejection(motion, covariance, task.prior)
         about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about, **task.attitude.about}
@@ -525,7 +526,7 @@ class _ReliefLevel:
         )
 
     def gradients_by_lean(self, v: NDArray[np.float64], heights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the derivatives of all gradients by the frames' differences of height, pitch, roll ``(3, 4, blocks)``."""
+        """Return the derivatives of all gradients by :meth:`GroundNodes.leaning_shift` ``(5, 4, blocks)``."""
         sides, shifts = self._resample(v, heights), self.cells.leaning_shift_of_cells(v)
         assert sides is not None
         sums = [
@@ -679,7 +680,7 @@ def _assessed(
     prior_weight = equations.noise * prior
     block_changes = inverse @ equations.reduced_gradients(prior, height_offsets)
     # these differences change the gradients of both motion and heights; eliminate the heights as above
-    by_lean = np.zeros((3, 3))
+    by_lean = np.zeros((3, 5))
     if lean_gradients is not None:
         reduced = lean_gradients[:, :3] - equations.cross * (lean_gradients[:, 3:] / (equations.height + prior_weight))
         by_lean = inverse @ reduced.sum(axis=-1).T

@@ -98,8 +98,8 @@ class Fit(NamedTuple):
         converged: whether the iteration settled.
         covariance: of the unknowns, from the residuals.
         by_height: derivative of the motion by the height ``(3,)``.
-        by_lean: derivative of the motion by the excess of height, pitch and roll of the second frame over the first
-            ``(3, 3)``. The signs of both derivatives do not matter to a covariance.
+        by_lean: derivative of the motion by the excess of height, pitch and roll of the second frame over the first, and by
+            the pitch and roll of both ``(3, 5)``. The signs of both derivatives do not matter to a covariance.
         correlation: of the registered frames.
         independent: number of cells with independent noise.
         blocks: effective number of blocks that share the information.
@@ -572,11 +572,11 @@ class Cells:
         return self._on_patches(self.nodes.lifted_shift(v))
 
     def leaning_shift_of_cells(self, v: Doubles) -> list[Floats]:
-        """Return the derivatives of :meth:`shift` by height, pitch, roll differences, each ``(2, bins, beams)``."""
+        """Return the derivatives of :meth:`GroundNodes.leaning_shift`, each ``(2, bins, beams)``."""
         return [self._on_all(nodes) for nodes in self.nodes.leaning_shift(v)]
 
     def leaning_shift(self, v: Doubles) -> Doubles:
-        """Return the derivatives of :meth:`leaning_shift_of_cells` at the patch centres ``(3, 2, patches)``."""
+        """Return the derivatives of :meth:`leaning_shift_of_cells` at the patch centres ``(5, 2, patches)``."""
         return self._on_patches(self.nodes.leaning_shift(v))
 
 
@@ -777,19 +777,21 @@ class GroundNodes:
         """Return the derivative of :meth:`shift` by the excess of height, pitch and roll of the second frame.
 
         Returns:
-            Ranges [m] and bearings [rad] per metre of height and per radian of pitch and of roll ``(3, 2, nodes, nodes)``; 0
-            if nothing is unknown.
+            Ranges [m] and bearings [rad] per metre of height and per radian of pitch and of roll, then per radian of pitch
+            and of roll of both frames ``(5, 2, nodes, nodes)``; 0 if nothing is unknown.
         """
         if not any(self.attitude.unsure):
-            return np.zeros((3, *self.derivative.shape[1:]))
+            return np.zeros((5, *self.derivative.shape[1:]))
         row, column = self._source_nodes_of_frames[0]
         changes = []
-        for name in ("height_m", "pitch_rad", "roll_rad"):
+        excess, both = (-0.5, 0.5), (1.0, 1.0)
+        names = ("height_m", excess), ("pitch_rad", excess), ("roll_rad", excess), ("pitch_rad", both), ("roll_rad", both)
+        for name, parts in names:
             ends = []
             for sign in (-1, 1):
                 ground, other_ground = (
-                    replace(one, **{name: getattr(one, name) + half * sign * LEAN_STEP / 2})
-                    for one, half in zip(self._grounds_of_frames, (-1, 1), strict=True)
+                    replace(one, **{name: getattr(one, name) + part * sign * LEAN_STEP})
+                    for one, part in zip(self._grounds_of_frames, parts, strict=True)
                 )
                 ends.append(self._between(ground, other_ground, v[:3]))
             changes.append((ends[1] - ends[0]) / (2 * LEAN_STEP))
