@@ -732,7 +732,7 @@ def graph_path(
             raise MitsonarError("a search for loops needs frames that show level ground: give the height and the pitch")
         loops = search(before, errors, canvas)
         after = _closed(replace(graph, start=before.poses), loops, before)
-    return _path_of(after, before, measured.time_s, start, sensors, loops)
+    return _path_of(after, before, graph.chain, measured.time_s, start, sensors, loops)
 
 
 def _closed(graph: PoseGraph, search: LoopSearch, before: GraphSolution) -> GraphSolution:
@@ -752,6 +752,7 @@ def _closed(graph: PoseGraph, search: LoopSearch, before: GraphSolution) -> Grap
 def _path_of(
     solution: GraphSolution,
     before: GraphSolution,
+    chain: PoseEdges,
     time_s: Array,
     start: Pose,
     sensors: VehicleSensors | None,
@@ -766,10 +767,13 @@ def _path_of(
     poses[:, 2] += 0.0 if rises is None else rises
     moved = relative_motions(solution.poses, np.arange(count - 1), np.arange(1, count))
     motion_covariances = solution.motion_covariances(covariances, following)
-    # headings of the graph are those that the sensors state: with the noise of the roll by which they were corrected
+    # yaws of the graph are those of the sensors, with the noise of the roll by which they were corrected. Where frames show
+    # only a sum of sideways motion and yaw, the former errs, too. The noise does not add up, so that no edge has it
     if sensors is not None:
         turn = sensors.turn_std(time_s)
-        motion_covariances[:, 2, 2] += smoothed_change(turn[:-1], turn[1:], np.diff(time_s)) ** 2
+        by_yaw = chain.covariances[:, :, 2] / chain.covariances[:, 2, 2][:, None]
+        by_yaw = by_yaw * smoothed_change(turn[:-1], turn[1:], np.diff(time_s))[:, None]
+        motion_covariances = motion_covariances + by_yaw[:, :, None] * by_yaw[:, None]
         covariances[:, 2, 2] += smoothed_change(turn[:1], turn, time_s - time_s[0]) ** 2
     last = count - 1
     end = before.columns([last])[last, :2, 0, :2]
@@ -803,8 +807,6 @@ def _graph(
     others, bias, headings = PoseEdges.none(), None, Headings.none()
     if sensors is not None:
         measurements = sensors.motions(measured.time_s)
-        noise = sensors.turn_std(measured.time_s)
-        chain.covariances[:, 2, 2] += smoothed_change(noise[:-1], noise[1:], measured.step_s) ** 2
         chain.covariances[~measured.is_valid & _determined(sensors, measured.time_s)] = np.diag(UNKNOWN_STD**2)
         if measurements:
             pair, motions, covariances, bias = (np.concatenate(parts) for parts in zip(*measurements, strict=True))

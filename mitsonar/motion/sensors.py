@@ -555,7 +555,7 @@ class VehicleSensors:
     def attitude_std(self, time_s: Array) -> Array:
         """Return standard deviations of smoothed depth [m], pitch and roll [rad] of the vehicle ``(frames, 3)``; 0 without.
 
-        They hold the noise of the readings. :func:`smoothed_change` gives those of the change between two frames.
+        They hold the noise of the readings; :func:`mitsonar.motion.sensors.smoothed_change` gives those of a change.
         """
         none = np.zeros(len(time_s))
         readings = self.depth, self.pitch, self.roll
