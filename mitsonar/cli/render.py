@@ -307,12 +307,12 @@ def impulse(
 
     loaded, origin = _load(scene, parameter)
     sonar, attitude = _channel_sonar(channel_sonar_in(loaded), model, seed, set_ or [])
-    flown, speeds = _channel_path(sonar, attitude, velocity, frames, start, trajectory, frame)
+    named = convention_named(frame).name
+    motions = _motions(loaded, moving, named)
+    flown, speeds = _channel_path(sonar, attitude, velocity, frames, start, trajectory, frame, moves=bool(motions))
     folder = out or Path("out") / f"{find_scene(scene).stem}-impulse"
     parts = _mirrors(mirrors, mirror or [])
     origin |= {"mirrors": True if parts == "materials" else parts} if parts else {}
-    named = convention_named(frame).name
-    motions = _motions(loaded, moving, named)
     bodies = MovingBodies.of(read_motion_specs(motions), named, flown)
     origin |= {"moving": digests_of(motions)} if motions else {}
     simulator = ChannelSimulator(loaded, sonar, mirrors=parts, moving=bodies)
@@ -398,8 +398,10 @@ def _channel_path(
     start: str | None,
     path: str | None,
     frame: str,
+    *,
+    moves: bool,
 ) -> tuple[Trajectory, NDArray[np.float64]]:
-    """Return the poses and velocities that the options define."""
+    """Return the poses and velocities that the options define; ``moves`` says whether bodies move."""
     import numpy as np
 
     from mitsonar.motion.composition import steady
@@ -434,7 +436,7 @@ def _channel_path(
         raise MitsonarError(f"--velocity takes vx,vy or vx,vy,turn (m/s, m/s, deg/s): got {velocity!r}")
     count = 2 if velocity is None else velocity.count(",") + 1
     speed = [*(numbers(velocity, count, "--velocity (m/s, m/s, deg/s)") or [0.0, 0.0]), 0.0][:3]
-    if velocity is None and (frames or 1) > 1:
+    if velocity is None and (frames or 1) > 1 and not moves:
         warn("the vehicle does not move, so that all pings are equal: give --velocity vx,vy in m/s, or --trajectory")
     return steady(begin, (speed[0], speed[1], math.radians(speed[2])), frames or 1, sonar.frame_rate_hz)
 

@@ -47,7 +47,7 @@ from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import AXES, assess, in_units, motion_errors, path_length
 from mitsonar.motion.pose import Pose
-from mitsonar.motion.sensors import UNKNOWN_STD, Headings, VehicleSensors, smoothed_change, wrapped
+from mitsonar.motion.sensors import UNKNOWN_STD, Headings, VehicleSensors, leaning_mount, smoothed_change, wrapped
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
 
@@ -164,7 +164,7 @@ def odometry(
     )
     estimates = continued(estimates)
     doubt = "" if sensors is None else contradiction(sensors, estimates, time_s)
-    if doubt and not any(one.valid for one in estimates):
+    if doubt and sum(one.valid for one in estimates) < 2:
         raise MitsonarError(doubt)
     # 3. inflate covariances to explain the loop residuals, and refine the motions by the local map
     steps = options.closure
@@ -656,6 +656,8 @@ def contradiction(sensors: VehicleSensors, estimates: Sequence[Estimate], time_s
         compared = gyro.covers(time_s) & np.array([one.valid or FROM_PRIOR in one.reason for one in estimates])
         seen = np.array([one.motion.yaw for one in estimates])[compared]
         turned = (gyro.means(time_s) * np.diff(time_s))[compared]
+        if len(seen) > 2 and _rolls_against(sensors, seen - turned, time_s, compared):
+            return f"{against} of {count_noun(count, 'motion')} contradict {sensors.name}: {WRONG_ROLL}"
         slope = float(seen @ turned / max(float(turned @ turned), np.finfo(float).tiny))
         if len(seen) > 2 and abs(np.corrcoef(seen, turned)[0, 1]) > CLEARLY_RELATED:
             faults = []
@@ -669,6 +671,20 @@ def contradiction(sensors: VehicleSensors, estimates: Sequence[Estimate], time_s
                 else f"the frames turn {slope:.2g} times as far; {cause}"
             )
     return f"{against} of {count_noun(count, 'motion')} contradict {sensors.name}: {cause}"
+
+
+WRONG_ROLL = "vehicle_roll_deg seems to have the wrong sign, since it is positive with starboard down"
+
+
+def _rolls_against(sensors: VehicleSensors, unexplained: Array, time_s: Array, compared: NDArray[np.bool_]) -> bool:
+    """Return whether the turns [rad] that the gyroscope leaves unexplained are twice those of the roll, reversed."""
+    lean = sensors.attitudes(time_s)
+    if lean is None:
+        return False
+    turned = np.diff(leaning_mount(lean, sensors.mount_rad)[:, 2])[compared]
+    power = float(turned @ turned)
+    related = power > 0 and abs(np.corrcoef(unexplained, turned)[0, 1]) > CLEARLY_RELATED
+    return bool(related and -3 < float(unexplained @ turned) / power < -1)
 
 
 def errors_along(motions: Array, canvas: Canvas | None) -> CorrelatedErrors:
@@ -732,7 +748,7 @@ def graph_path(
             raise MitsonarError("a search for loops needs frames that show level ground: give the height and the pitch")
         loops = search(before, errors, canvas)
         after = _closed(replace(graph, start=before.poses), loops, before)
-    return _path_of(after, before, measured.time_s, start, sensors, loops)
+    return _path_of(after, before, graph.chain, measured.time_s, start, sensors, loops)
 
 
 def _closed(graph: PoseGraph, search: LoopSearch, before: GraphSolution) -> GraphSolution:
@@ -752,6 +768,7 @@ def _closed(graph: PoseGraph, search: LoopSearch, before: GraphSolution) -> Grap
 def _path_of(
     solution: GraphSolution,
     before: GraphSolution,
+    chain: PoseEdges,
     time_s: Array,
     start: Pose,
     sensors: VehicleSensors | None,
@@ -766,10 +783,13 @@ def _path_of(
     poses[:, 2] += 0.0 if rises is None else rises
     moved = relative_motions(solution.poses, np.arange(count - 1), np.arange(1, count))
     motion_covariances = solution.motion_covariances(covariances, following)
-    # headings of the graph are those that the sensors state: with the noise of the roll by which they were corrected
+    # yaws of the graph are those of the sensors, with the noise of the roll by which they were corrected. Where frames show
+    # only a sum of sideways motion and yaw, the former errs, too. The noise does not add up, so that no edge has it
     if sensors is not None:
         turn = sensors.turn_std(time_s)
-        motion_covariances[:, 2, 2] += smoothed_change(turn[:-1], turn[1:], np.diff(time_s)) ** 2
+        by_yaw = chain.covariances[:, :, 2] / chain.covariances[:, 2, 2][:, None]
+        by_yaw = by_yaw * smoothed_change(turn[:-1], turn[1:], np.diff(time_s))[:, None]
+        motion_covariances = motion_covariances + by_yaw[:, :, None] * by_yaw[:, None]
         covariances[:, 2, 2] += smoothed_change(turn[:1], turn, time_s - time_s[0]) ** 2
     last = count - 1
     end = before.columns([last])[last, :2, 0, :2]
@@ -803,8 +823,6 @@ def _graph(
     others, bias, headings = PoseEdges.none(), None, Headings.none()
     if sensors is not None:
         measurements = sensors.motions(measured.time_s)
-        noise = sensors.turn_std(measured.time_s)
-        chain.covariances[:, 2, 2] += smoothed_change(noise[:-1], noise[1:], measured.step_s) ** 2
         chain.covariances[~measured.is_valid & _determined(sensors, measured.time_s)] = np.diag(UNKNOWN_STD**2)
         if measurements:
             pair, motions, covariances, bias = (np.concatenate(parts) for parts in zip(*measurements, strict=True))

@@ -222,6 +222,9 @@ def bridged(measured: MotionSeries) -> MotionSeries:
         middle = measured.middle_s
         velocity = np.column_stack([np.interp(middle, middle[known], v[known]) for v in measured.velocity.T])
         fill, fill_covariances = velocity * measured.step_s[:, None], None
+        if measured.covariances is not None:  # from a single motion: as uncertain as it is large
+            large = np.diag(measured.motions[known[0]] ** 2)
+            fill_covariances = np.broadcast_to(measured.covariances[known[0]] + large, (len(measured), 3, 3))
     together = np.where(measured.is_valid[:, None], measured.motions, fill)
     if fill_covariances is None or measured.covariances is None:
         return MotionSeries(together, measured.time_s)

@@ -7,6 +7,7 @@ gives the same frames as a recording, with labels. :func:`poses_at` interpolates
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterator
@@ -65,6 +66,9 @@ PATTERN_FRAMES = 64
 
 FITTED, FITTED_RUNS = 3, 4
 """Number of consecutive frames in a run for fitting the contrast, and the number of such runs."""
+
+LARGE_NOISE = 5.0
+"""Noise of a gyroscope by the unknown roll, over its own, from which a warning is due."""
 
 PLANAR = 1e-6
 """Smallest change of height, pitch or roll that makes a path non-planar [m, rad]: files round them."""
@@ -268,7 +272,7 @@ class FrameSource:
             leans = np.column_stack([std[:, 0], np.full((len(self), 2), usual * (self.pitch_rad is not None))])
             aided = replace(self, rise_m=rise, height_m=heights, attitude_std=leans)
         if lean is None:
-            return aided, sensors
+            return aided, self._with_unknown_roll(sensors)
         known = self.attitudes(np.arange(len(self)))
         if known is None:
             raise MitsonarError(
@@ -281,6 +285,24 @@ class FrameSource:
             aided = replace(aided, attitude_rad=lean, pitch_rad=None, attitude_std=on_mount)
             return aided, sensors.on_mount(self.pitch_rad)
         return aided, sensors.on_mount(float(np.nanmean(known[:, 3] - lean[:, 0])))
+
+    def _with_unknown_roll(self, sensors: VehicleSensors) -> VehicleSensors:
+        """Return sensors whose gyroscope has the noise of turns that the vehicle's roll gives a pitched sonar."""
+        gyro = sensors.yaw_rate
+        if gyro is None or self.pitch_rad is None or self.poses is not None:
+            return sensors
+        turn_s = abs(math.tan(self.pitch_rad)) * UNKNOWN_PER_S.roll_rad  # on a calm day
+        step_s = float(np.median(np.diff(self.time_s)))
+        noise = turn_s * math.sqrt(step_s)
+        if noise > LARGE_NOISE * float(np.median(gyro.std)):
+            warnings.warn(
+                f"{self.name}: as the vehicle rolls, a sonar pitched by {math.degrees(self.pitch_rad):.3g} deg turns by "
+                f"some {math.degrees(turn_s * step_s):.2g} deg in a motion, which the gyroscope of {sensors.name} does not "
+                "see: add vehicle_pitch_deg and vehicle_roll_deg, or it hardly counts",
+                MitsonarWarning,
+                stacklevel=4,
+            )
+        return replace(sensors, yaw_rate=replace(gyro, std=np.hypot(gyro.std, noise)))
 
     @property
     def sonar_poses(self) -> Array | None:

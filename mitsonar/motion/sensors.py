@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_smoothing_spline
 
-from mitsonar.errors import MitsonarError, MitsonarWarning, suggest_names
+from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.io.csv_table import CsvTable
 from mitsonar.io.files import write_atomic
 from mitsonar.motion.composition import Motion, MotionPrior, motions
@@ -555,7 +555,7 @@ class VehicleSensors:
     def attitude_std(self, time_s: Array) -> Array:
         """Return standard deviations of smoothed depth [m], pitch and roll [rad] of the vehicle ``(frames, 3)``; 0 without.
 
-        They hold the noise of the readings. :func:`smoothed_change` gives those of the change between two frames.
+        They hold the noise of the readings; :func:`mitsonar.motion.sensors.smoothed_change` gives those of a change.
         """
         none = np.zeros(len(time_s))
         readings = self.depth, self.pitch, self.roll
@@ -754,8 +754,7 @@ def _parse_readings(table: CsvTable, time: Array, name: str) -> Readings | None:
     if not known.any():
         return None
     if noise not in table.names:
-        hint = suggest_names(noise, [one for one in table.names if one]) if table.names else ""
-        raise MitsonarError(f"{table.path} has {name}, but not its noise: add the column {noise} ({hint})")
+        raise MitsonarError(f"{table.path} has {name}, but not its noise: add the column {noise}")
     first, std = _first_number(table, noise), _column(table, noise)
     std = np.where(np.isfinite(std), std, first)
     try:

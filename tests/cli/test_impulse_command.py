@@ -209,6 +209,7 @@ def test_bodies_move(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     for name, more in {"moves": ["--moving", f"fish={tmp_path / 'fish.tum'}"], "rests": []}.items():
         done = mitsonar("impulse", scene, "--frames", 2, "--set", "points_per_m2=50", *more, "-o", tmp_path / name)
         assert done.returncode == 0, done.stderr
+        assert ("does not move" in done.stderr) == (name == "rests")
         runs[name] = ImpulseResponses.load(tmp_path / name).response[:, 0]
     early = slice(0, 8 * 12)  # before 9 m there and back: the fish alone
     assert np.abs(runs["rests"][:, early]).max() < 0.2 * np.abs(runs["moves"][:, early]).max()

@@ -18,6 +18,7 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.mapping.series import (
     MotionSeries,
+    bridged,
     ellipse,
     fit_noise,
     fit_scale,
@@ -527,3 +528,13 @@ def test_what_has_no_pose_covariance() -> None:
         pose_covariances(replace(measured, covariances=None), START)
     with pytest.raises(MitsonarError, match="2 motions are not valid"):
         pose_covariances(replace(measured, valid=np.arange(9) > 1), START)
+
+
+def test_one_valid_motion_bridges_with_its_own_size_as_error() -> None:
+    moved = np.array([[np.nan] * 3, [0.01, 0.05, 0.02], [np.nan] * 3])
+    covariances = np.tile(np.diag(STD**2), (3, 1, 1))
+    filled = bridged(MotionSeries(moved, np.arange(4.0), covariances, np.array([False, True, False])))
+    np.testing.assert_allclose(filled.motions, np.tile(moved[1], (3, 1)))
+    assert filled.covariances is not None
+    np.testing.assert_array_equal(filled.covariances[1], covariances[1])
+    np.testing.assert_allclose(filled.covariances[0], np.diag(STD**2 + moved[1] ** 2))

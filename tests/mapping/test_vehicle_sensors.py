@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from scipy.interpolate import make_smoothing_spline
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import Estimate, prior_rejection
 from mitsonar.geometry.ground import UNKNOWN_PER_S, USUAL_LEAN_RAD, attitude_of
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.mapping.odometry import contradiction, graph_path
 from mitsonar.mapping.sensors import SensorNoise, open_sensors, simulated_sensors
 from mitsonar.mapping.series import MotionSeries
@@ -26,11 +28,13 @@ from mitsonar.motion.sensors import (
     SMOOTHED_S,
     Readings,
     VehicleSensors,
+    leaning_mount,
     load_sensors,
     save_sensors,
     smoothed_change,
 )
 from mitsonar.motion.trajectory import Trajectory
+from mitsonar.records.frames import SonarFrames
 
 Array = NDArray[np.float64]
 
@@ -453,6 +457,47 @@ def test_a_gyroscope_that_the_frames_contradict_is_named_with_the_likely_cause(
         f"{sum(not one.valid for one in estimates)} of 59 motions contradict the sensors of s.csv"
     ) == (cause != "")
     assert cause in sentence
+
+
+def test_a_roll_of_the_wrong_sign_is_named() -> None:
+    """The sonar, pitched by 25 deg, turns as the vehicle rolls; with the sign reversed the gyroscope errs by twice that."""
+    time, pitch = np.arange(0, 12, 0.02), np.radians(25)
+    roll = np.radians(4) * np.sin(1.3 * time)
+    still = 0 * time
+    covariance = np.diag([1e-3, 1e-3, np.radians(0.02)]) ** 2
+    frames_s = np.arange(1, 11, 0.2)
+    heading = leaning_mount(np.column_stack([0 * frames_s, np.interp(frames_s, time, roll)]), pitch)[:, 2]
+    for sign in (1, -1):
+        sensors = VehicleSensors(
+            yaw_rate=readings(time, still, 1e-5),
+            pitch=readings(time, still, 1e-3),
+            roll=readings(time, sign * roll, 1e-3),
+            name="the sensors of s.csv",
+        ).on_mount(pitch)
+        estimates: list[Estimate] = []
+        for yaw, prior in zip(np.diff(heading), sensors.priors(frames_s) or [], strict=True):
+            motion = Motion(0.0, 0.0, float(yaw))
+            reason = prior_rejection(motion, covariance, prior)
+            estimates.append(Estimate(motion, covariance, not reason, reason))
+        sentence = contradiction(sensors, estimates, frames_s)
+        assert ("vehicle_roll_deg seems to have the wrong sign" in sentence) == (sign < 0)
+
+
+def test_a_gyroscope_without_the_roll_of_the_vehicle_counts_little() -> None:
+    """A sonar that looks 25 deg down turns by tan(25 deg) of the roll, 4 deg/s on a calm day."""
+    time_s = np.arange(10) / 5
+    image = np.zeros((10, 20, 12), np.float32)
+    sonar = Sonar.create(beams=12, range_bins=20)
+    frames = SonarFrames(image, sonar.range_m, sonar.bearing_rad, time_s, sonar)
+    source = replace(FrameSource.of(frames), pitch_rad=math.radians(25))
+    sensors = VehicleSensors(yaw_rate=readings(np.linspace(-0.1, 2.2, 116), np.zeros(116), 1e-5), name="s.csv")
+    with pytest.warns(MitsonarWarning, match=r"by 25 deg turns by some 0\.37 deg in a motion.*add vehicle_pitch_deg"):
+        _, widened = source.with_sensors(sensors)
+    (measured,) = widened.motions(time_s)
+    turn = math.tan(math.radians(25)) * math.radians(4) * 0.2
+    np.testing.assert_allclose(np.sqrt(measured.covariances[:, 2, 2]), turn, rtol=1e-3)
+    _, level = replace(source, pitch_rad=0.0).with_sensors(sensors)
+    np.testing.assert_array_equal(level.yaw_rate.std, sensors.yaw_rate.std)  # type: ignore[union-attr]
 
 
 def test_sensors_of_another_clock_are_refused_with_both_clocks() -> None:
