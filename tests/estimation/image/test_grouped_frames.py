@@ -82,7 +82,8 @@ def test_a_mosaic_of_grouped_frames_is_that_of_single_pings() -> None:
         ]
         image, poses = np.array(images, dtype=np.float32), np.array(middles)
         sonar = SONAR if name == "grouped" else SONAR.replace(ping_groups=1)
-        frames = SonarFrames(image, SONAR.range_m, SONAR.bearing_rad, 0.1 * np.arange(len(image)), sonar, poses=poses)
+        time_s = 0.1 * np.arange(len(image), dtype=np.float64)
+        frames = SonarFrames(image, SONAR.range_m, SONAR.bearing_rad, np.asarray(time_s, np.float64), sonar, poses=poses)
         maps[name] = build_mosaic(frames, height_m=HEIGHT, options=MosaicOptions(cell_m=0.02)).mean
     apart = {name: float(np.nanstd(maps[name] - maps["single"])) for name in ("grouped", "unknown")}
     assert apart["grouped"] < 0.4 * apart["unknown"]
