@@ -64,6 +64,7 @@ __all__ = [
     "closure_of",
     "contradiction",
     "errors_along",
+    "follows_depth",
     "graph_path",
     "height_profile",
     "loop_starts",
@@ -166,6 +167,8 @@ def odometry(
     doubt = "" if sensors is None else contradiction(sensors, estimates, time_s)
     if doubt and sum(one.valid for one in estimates) < 2:
         raise MitsonarError(doubt)
+    if not doubt and sensors is not None and isinstance(source, FrameSource) and source.rise_m is not None:
+        doubt = follows_depth(estimates, source.rise_m[numbers], sensors.name)
     # 3. inflate covariances to explain the loop residuals, and refine the motions by the local map
     steps = options.closure
     closing = closure_of(source, estimator, numbers, estimates, steps, progress) if steps else None
@@ -671,6 +674,34 @@ def contradiction(sensors: VehicleSensors, estimates: Sequence[Estimate], time_s
                 else f"the frames turn {slope:.2g} times as far; {cause}"
             )
     return f"{against} of {count_noun(count, 'motion')} contradict {sensors.name}: {cause}"
+
+
+FOLLOWS, FOLLOWS_CLEARLY = 0.25, 0.9
+"""Motion ahead for each metre of rise [m/m], and its correlation with the rise, from which motions follow the depth."""
+
+FEWEST_TO_FOLLOW = 10
+
+
+def follows_depth(estimates: Sequence[Estimate], rise_m: Array, name: str) -> str:
+    """Return a sentence where motions ahead follow the depth, which then has a wrong sign or unit; else nothing.
+
+    A rise that is not taken out looks like motion ahead: the ground recedes. One that is taken out twice does so, reversed.
+
+    Args:
+        estimates: estimate of each pair of frames.
+        rise_m: rise of the sonar by its depth, at each frame ``(frames,)`` [m].
+        name: of the sensors.
+    """
+    valid = np.flatnonzero([one.valid for one in estimates])
+    if len(valid) < FEWEST_TO_FOLLOW:
+        return ""
+    ahead, rise = np.array([one.motion.forward for one in estimates])[valid], np.diff(rise_m)[valid]
+    ahead, rise = (values - np.polyval(np.polyfit(valid, values, 2), valid) for values in (ahead, rise))
+    slope = float(ahead @ rise / max(float(rise @ rise), np.finfo(float).tiny))
+    if abs(slope) < FOLLOWS or abs(np.corrcoef(ahead, rise)[0, 1]) < FOLLOWS_CLEARLY:
+        return ""
+    cause = "check the sign of depth_m, which grows downwards" if slope > 0 else "check that depth_m is in metres"
+    return f"motions ahead follow the depth of {name}, by {slope:.2g} m for each metre that it rises: {cause}"
 
 
 WRONG_ROLL = "vehicle_roll_deg seems to have the wrong sign, since it is positive with starboard down"

@@ -17,7 +17,7 @@ from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import Estimate, prior_rejection
 from mitsonar.geometry.ground import UNKNOWN_PER_S, USUAL_LEAN_RAD, attitude_of
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.mapping.odometry import contradiction, graph_path
+from mitsonar.mapping.odometry import contradiction, follows_depth, graph_path
 from mitsonar.mapping.sensors import SensorNoise, open_sensors, simulated_sensors
 from mitsonar.mapping.series import MotionSeries
 from mitsonar.mapping.sources import FrameSource
@@ -481,6 +481,18 @@ def test_a_roll_of_the_wrong_sign_is_named() -> None:
             estimates.append(Estimate(motion, covariance, not reason, reason))
         sentence = contradiction(sensors, estimates, frames_s)
         assert ("vehicle_roll_deg seems to have the wrong sign" in sentence) == (sign < 0)
+
+
+@pytest.mark.parametrize(("slope", "cause"), [(0.87, "the sign of depth_m"), (-0.44, "in metres"), (0.02, ""), (0.0, "")])
+def test_motions_that_follow_the_depth_are_doubted(slope: float, cause: str) -> None:
+    rng = np.random.default_rng(4)
+    rise = 0.1 * np.sin(np.arange(40) / 3)
+    ahead = 0.06 + 1e-3 * rng.normal(size=39) + slope * np.diff(rise)
+    estimates = [Estimate(Motion(0.0, float(one), 0.0), None, number % 7 != 0) for number, one in enumerate(ahead)]
+    doubt = follows_depth(estimates, rise, "s.csv")
+    assert cause in doubt
+    assert (doubt == "") == (cause == "")
+    assert follows_depth(estimates[:9], rise[:10], "s.csv") == ""
 
 
 def test_a_gyroscope_without_the_roll_of_the_vehicle_counts_little() -> None:
