@@ -1,6 +1,7 @@
 """Trains PoseNet of tables 3.2 and 3.3 without and with noise, and ours with noise, at once on one GPU from one data set.
 
-    python benchmarks/gpu/flagships.py OUT --minutes 11 [--device cpu --small]
+    python benchmarks/gpu/flagships.py OUT --minutes 11
+    python benchmarks/gpu/flagships.py --quick        # on a CPU: narrow networks, a few frames, kept nowhere
 
 Processors render the data while the GPU measures how many pairs a second two trainings see, as they are and compiled. From
 that follow the epochs that fit into the minutes; the learning rate is halved at the same fractions of them as in the thesis.
@@ -18,6 +19,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -55,13 +57,20 @@ BENCH_DATA = ("--set", "scenes=[{count: 1, sequences: 60, world: {size_m: 30}}]"
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path, help="data, trainings, results")
+    parser.add_argument("out", type=Path, nargs="?", help="data, trainings, results")
     parser.add_argument("--minutes", type=float, default=11, help="of this call, evaluation included")
     parser.add_argument("--device", choices=["cuda", "cpu"], default="cuda")
     parser.add_argument("--batch", type=int, default=64, help="pairs per step")
     parser.add_argument("--small", action="store_true", help="a check of the steps: narrow networks, a few frames")
+    parser.add_argument("--quick", action="store_true", help="--small --device cpu, kept nowhere")
     parser.add_argument("--train", nargs=2, metavar=("NAME", "JSON"), help="one training, started by this script")
     arguments = parser.parse_args()
+    if arguments.quick:
+        with tempfile.TemporaryDirectory() as folder:
+            words = [sys.executable, __file__, folder, "--small", "--device", "cpu", "--minutes", "8"]
+            raise SystemExit(subprocess.run(words).returncode)
+    if arguments.out is None:
+        parser.error("a folder is missing: give OUT, or --quick")
     end = time.monotonic() + 60 * arguments.minutes
     if arguments.train:
         return trained(arguments, arguments.train[0], json.loads(arguments.train[1]))

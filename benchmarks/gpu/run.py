@@ -484,7 +484,8 @@ STEPS: dict[str, Callable[[Request], Found]] = {
 }
 """In the order in which they are done."""
 
-IN_SMALL = {*STEPS} - {*TABLE_52[1:]}
+IN_SMALL = {*STEPS} - {"flagships", *TABLE_52[1:]}
+"""Steps of a small scale; flagships.py has its own."""
 
 
 if __name__ == "__main__":
