@@ -35,7 +35,7 @@ ROWS = {"posenet-normx10": "3.2", "posenet-normx10-low-noise": "3.3"}
 """Rows trained at once, and the table of each."""
 
 OURS = "posenet-noise"
-"""Recipe trained beside them, from the weights that come along."""
+"""Recipe trained at the same time, from the weights of `posenet`."""
 
 THESIS_EPOCHS = 32.0
 SHARE = 0.42

@@ -24,14 +24,18 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import torch
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 sys.path.insert(0, str(HERE))
 
+import flagships as flagships_of  # noqa: E402
 import pack  # noqa: E402
 
 TABLE_52 = (
@@ -442,7 +446,9 @@ def weights(arguments: Request) -> Found:
 
     output: Plain = {}
     (arguments.out / "weights").mkdir(exist_ok=True)
-    for path in sorted([*arguments.out.glob("**/runs/*/network.ckpt"), *arguments.out.glob("flagships/*/network.ckpt")]):
+    for path in sorted(
+        [*arguments.out.glob("**/runs/*/network.ckpt"), *arguments.out.glob(f"flagships/{flagships_of.OURS}/network.ckpt")]
+    ):
         out = arguments.out / "weights" / f"{path.parent.name}.bf16"
         torch.save(halved(torch.load(path, map_location="cpu", weights_only=True)), out)
         output[path.parent.name] = f"{out.stat().st_size:,} bytes"
@@ -453,22 +459,23 @@ def halved(value: Saved) -> Saved:
     """Convert all tensors of 32-bit numbers to bf16."""
     import torch
 
-    if isinstance(value, torch.Tensor):
-        return value.to(torch.bfloat16) if value.dtype == torch.float32 else value
-    if isinstance(value, dict):
-        return {key: halved(one) for key, one in value.items()}
-    return [halved(one) for one in value] if isinstance(value, list) else value
+    return converted(value, torch.float32, torch.bfloat16)
 
 
 def full(value: Saved) -> Saved:
     """Convert all tensors of bf16 to 32-bit numbers."""
     import torch
 
-    if isinstance(value, torch.Tensor):
-        return value.to(torch.float32) if value.dtype == torch.bfloat16 else value
+    return converted(value, torch.bfloat16, torch.float32)
+
+
+def converted(value: Saved, old: torch.dtype, new: torch.dtype) -> Saved:
+    """Convert all tensors of one type to another, and leave the rest as it is."""
     if isinstance(value, dict):
-        return {key: full(one) for key, one in value.items()}
-    return [full(one) for one in value] if isinstance(value, list) else value
+        return {key: converted(one, old, new) for key, one in value.items()}
+    if isinstance(value, list):
+        return [converted(one, old, new) for one in value]
+    return value.to(new) if getattr(value, "dtype", None) == old else value
 
 
 STEPS: dict[str, Callable[[Request], Found]] = {

@@ -309,7 +309,9 @@ def impulse(
     sonar, attitude = _channel_sonar(channel_sonar_in(loaded), model, seed, set_ or [])
     named = convention_named(frame).name
     motions = _motions(loaded, moving, named)
-    flown, speeds = _channel_path(sonar, attitude, velocity, frames, start, trajectory, frame, moves=bool(motions))
+    flown, speeds = _channel_path(sonar, attitude, velocity, frames, start, trajectory, frame)
+    if velocity is None and trajectory is None and len(flown) > 1 and not motions:
+        warn("the vehicle does not move, so that all pings are equal: give --velocity vx,vy in m/s, or --trajectory")
     folder = out or Path("out") / f"{find_scene(scene).stem}-impulse"
     parts = _mirrors(mirrors, mirror or [])
     origin |= {"mirrors": True if parts == "materials" else parts} if parts else {}
@@ -398,10 +400,8 @@ def _channel_path(
     start: str | None,
     path: str | None,
     frame: str,
-    *,
-    moves: bool,
 ) -> tuple[Trajectory, NDArray[np.float64]]:
-    """Return the poses and velocities that the options define; ``moves`` says whether bodies move."""
+    """Return the poses and velocities that the options define."""
     import numpy as np
 
     from mitsonar.motion.composition import steady
@@ -436,8 +436,6 @@ def _channel_path(
         raise MitsonarError(f"--velocity takes vx,vy or vx,vy,turn (m/s, m/s, deg/s): got {velocity!r}")
     count = 2 if velocity is None else velocity.count(",") + 1
     speed = [*(numbers(velocity, count, "--velocity (m/s, m/s, deg/s)") or [0.0, 0.0]), 0.0][:3]
-    if velocity is None and (frames or 1) > 1 and not moves:
-        warn("the vehicle does not move, so that all pings are equal: give --velocity vx,vy in m/s, or --trajectory")
     return steady(begin, (speed[0], speed[1], math.radians(speed[2])), frames or 1, sonar.frame_rate_hz)
 
 

@@ -680,6 +680,7 @@ FOLLOWS, FOLLOWS_CLEARLY = 0.25, 0.9
 """Motion ahead for each metre of rise [m/m], and its correlation with the rise, from which motions follow the depth."""
 
 FEWEST_TO_FOLLOW = 10
+"""Smallest number of motions from which such a correlation is no accident."""
 
 
 def follows_depth(estimates: Sequence[Estimate], rise_m: Array, name: str) -> str:

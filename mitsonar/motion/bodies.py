@@ -225,12 +225,17 @@ class MovingBodies:
         """Return the names, poses and velocities at given times."""
         return BodyStates(self.names, self.poses(time_s), self.velocities(time_s))
 
-    def from_world(self, time_s: ArrayLike) -> NDArray[np.float64]:
-        """Return the first three rows of the transform from the world to each body's axes ``(times, bodies, 3, 4)``."""
+    def to_world(self, time_s: ArrayLike) -> NDArray[np.float64]:
+        """Return the first three rows of the transform from each body's axes to the world ``(times, bodies, 3, 4)``."""
         poses = self.poses(time_s)
         turn = vehicle_rotation(poses.reshape(-1, 6)).as_matrix().reshape(*poses.shape[:2], 3, 3)
-        back = turn.swapaxes(-1, -2)
-        return np.concatenate([back, -(back @ poses[..., :3, None])], axis=-1)
+        return np.concatenate([turn, poses[..., :3, None]], axis=-1)
+
+    def from_world(self, time_s: ArrayLike) -> NDArray[np.float64]:
+        """Return the first three rows of the transform from the world to each body's axes ``(times, bodies, 3, 4)``."""
+        rows = self.to_world(time_s)
+        back = rows[..., :3].swapaxes(-1, -2)
+        return np.concatenate([back, -(back @ rows[..., 3:])], axis=-1)
 
 
 # ---------------- Motion of bodies in YAML files

@@ -89,10 +89,8 @@ class Moment(NamedTuple):
     @classmethod
     def at(cls, motion: SceneMotion, time_s: float) -> Moment:
         """Return the bodies of a scene at a time [s]."""
-        back = motion.bodies.from_world(time_s)[0]
-        turn = back[:, :, :3].swapaxes(1, 2)
-        to_world = np.concatenate([turn, -(turn @ back[:, :, 3:])], axis=2)
-        return cls(motion.scene_at(time_s), to_world, motion.bodies.velocities(time_s)[0])
+        bodies = motion.bodies
+        return cls(motion.scene_at(time_s), bodies.to_world(time_s)[0], bodies.velocities(time_s)[0])
 
     def row(self, body: int) -> NDArray[np.float64]:
         """Return the 18 numbers of a body for a launch: its transform, its velocity and its rotation."""
@@ -318,8 +316,7 @@ class _WorldScatterers:
             )
             self.smooth = frozenset(places)
         same = like is not None and _points_of(like.sonar) == _points_of(sonar) and like.smooth == self.smooth
-        same = same and like is not None and like.among == among
-        if like is not None and same and np.array_equal(like.within, within):  # type: ignore[arg-type]
+        if like is not None and same and like.among == among and np.array_equal(like.within, within):  # type: ignore[arg-type]
             self.scatterers, self.stored = like.scatterers, like.stored
         else:
             self.scatterers = Scatterers.from_scene(scene, sonar, self.smooth, within, among)
