@@ -32,6 +32,7 @@ __all__ = [
     "local_std_db",
     "near_glow_db",
     "percentile_span_db",
+    "ping_groups",
     "range_profile_db",
     "smear_db",
     "stripes_by_group_db",
@@ -63,6 +64,16 @@ frame, those with the largest excess; standard errors that a leak must exceed.
 
 LEAK_CONTRAST = 1000.0
 """Smallest ratio of a row's brightest cell to its quiet beams; below 30 dB, a leak of -50 dB is not visible."""
+
+TEETH_WINDOW, TEETH_LAG, MOST_GROUPS = (15, 9), 48, 16
+"""Parameters of the search for ping groups: window of the local mean, greatest distance [beams], most groups."""
+
+TEETH_SURE, LEAST_TOOTH = 4.5, 0.005
+"""How far the correlation at the distances of a group must rise: standard errors, and the mean rise.
+
+Groups of six frames of an HAUV's DIDSON and of two recordings of an ARIS 3000 reach 3.5 to 10.5 and 0.007 to 0.019. Without
+groups, recordings and simulated scenes stay below 3.9 and 0.0035.
+"""
 
 MEDIAN_ABOVE_MEAN_DB = float(10 * np.log10(np.log(2)) + 10 / np.log(10) * np.euler_gamma)
 """Median of exponential intensities in dB minus the mean of their dB values: 0.91."""
@@ -193,6 +204,51 @@ def autocorrelation(level_db: ArrayLike, axis: int, lags: tuple[int, ...] = (1, 
 
 
 # ---------------- Effects of the instrument
+
+
+def ping_groups(level_db: ArrayLike) -> int:
+    """Return the number of interleaved ping groups; 1 if none are seen.
+
+    Beams of one ping share what leaks between channels, so that in the correlation of beams over their distance the
+    multiples of the number of groups rise above their neighbours. Frames without crosstalk, or with groups of adjacent
+    beams, do not show it.
+
+    Args:
+        level_db: ``(frames, bins, beams)``; another monotonic coding of levels does as well.
+    """
+    level = np.asarray(level_db, dtype=float)
+    beams = level.shape[-1]
+    most = min(beams // 2, TEETH_LAG)
+    if most < 4:
+        return 1
+    # 1. correlation of the grain of each two beams, by their distance; beams count equally
+    grain = detrended(level, TEETH_WINDOW)
+    grain -= grain.mean(axis=(0, 1))
+    spread = grain.std(axis=(0, 1))
+    grain /= np.where(spread > 0, spread, 1.0)
+    correlation = np.array([(grain[..., lag:] * grain[..., : beams - lag]).mean() for lag in range(most + 2)])
+    # 2. rise of each distance over its neighbours, without the next beam, which overlaps the beam
+    lags = np.arange(2, most + 1)
+    rise = _over_neighbours(correlation)[1:]
+    best, best_rise, sure = 1, 0.0, False
+    for groups in range(2, min(MOST_GROUPS, most // 2) + 1):
+        multiple = lags % groups == 0
+        mean, root = float(rise[multiple].mean()), math.sqrt(multiple.sum())
+        if mean * root > best_rise:
+            comb = _over_neighbours((np.arange(most + 2) % groups == 0).astype(float))[1:]
+            rest = rise - comb * (rise @ comb) / (comb @ comb)
+            best, best_rise = groups, mean * root
+            sure = mean > LEAST_TOOTH and mean * root > TEETH_SURE * min(_scatter(rise), _scatter(rest))
+    return best if sure else 1
+
+
+def _over_neighbours(values: Array) -> Array:
+    return np.asarray(values[1:-1] - (values[:-2] + values[2:]) / 2, dtype=np.float64)
+
+
+def _scatter(values: Array) -> float:
+    """Return the standard deviation of normal values, by the median of their distances from the middle one."""
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
 def beam_stripes_db(level_db: ArrayLike, window: int = 9) -> float:

@@ -43,6 +43,9 @@ GEOMETRY = (
 )  # fmt: skip
 """Fields that are taken from the recording rather than from a named sonar."""
 
+GROUPS = ("ping_groups", "group_order", "group_interval_s", "group_overhead_s")
+"""Fields that are taken from a recording that states ping groups."""
+
 LEAST_SHAPE = (96, 16)
 """Smallest number of bins and beams of a frame."""
 
@@ -184,12 +187,13 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     _check(frames)
     # 1. geometry and coding from the frames, everything else from the base
     recorded_sonar = frames.sonar
-    known = {name: getattr(recorded_sonar, name) for name in GEOMETRY}
+    stated = GEOMETRY if recorded_sonar.ping_groups == 1 else (*GEOMETRY, *GROUPS)
+    known = {name: getattr(recorded_sonar, name) for name in stated}
     coding = {"coding": frames.level, "coding_db": recorded_sonar.coding_db, "coding_gamma": recorded_sonar.coding_gamma}
     sonar = (recorded_sonar if base is None else base).replace(**{"model": "coherent", **known, **coding, **given})
     value = np.asarray(frames.image, dtype=float) / (255 if frames.image.dtype.kind == "u" else 1)
     notes: list[str] = []
-    # 2. the grain of dark windows gives a coding; with it, values become intensities
+    # 2. the grain of dark windows gives a coding; with it, values become intensities. Ping groups precede the beam width.
     clipped = _inside(statistics.window_values(value)).sum() < LEAST_WINDOWS
     span = gamma = None
     if clipped:
@@ -204,6 +208,9 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
         gamma = _gamma(value)
     sonar = _with_coding(sonar, span, gamma, measure_coding, notes)
     if not clipped:
+        if "ping_groups" not in given and sonar.ping_groups == 1 and (groups := statistics.ping_groups(value)) > 1:
+            sonar = sonar.replace(ping_groups=groups)
+            notes.append(f"beams {groups} apart share what leaks from one to another: ping_groups is {groups}")
         sonar = _with_resolution(sonar, value, frames.level == "dB" and not measure_coding, given, notes)
     intensity = decoded(value, sonar)
     level = statistics.decibels(intensity, float(statistics.decibels(intensity[intensity > 0].min())) - 3)

@@ -101,6 +101,18 @@ def test_autocorrelation_of_a_known_process(axis: int, along: float) -> None:
 # ---------------------------------------------------------------- the instrument
 
 
+@pytest.mark.parametrize("groups", [1, 2, 3, 8])
+def test_beams_of_a_ping_share_what_leaks(groups: int) -> None:
+    """A leak of -8 dB, so of the same phase in all beams of a ping; neighbours overlap if they belong to one."""
+    shape = (3, 400, 96)
+    leak = field((*shape[:2], groups), 4)[..., np.arange(96) % groups] if groups > 1 else 0.0
+    own = field(shape)
+    overlapping = (own + np.roll(own, 1, axis=2)) / np.sqrt(2) if groups == 1 else own
+    level = decibels(np.abs(overlapping + 10 ** (-8 / 20) * leak) ** 2) + ramp()[:1, :1]
+    assert statistics.ping_groups(level) == groups
+    assert statistics.ping_groups(level[..., :6]) == 1
+
+
 @pytest.mark.parametrize("spread", [0.0, 0.3, 0.6])
 def test_stripes_are_told_from_speckle(spread: float) -> None:
     gains = np.random.default_rng(3).normal(0, 1, 256)
