@@ -8,8 +8,9 @@ from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from mitsonar.acoustics.materials import Material, material, named_materials, single_mu
+from mitsonar.acoustics.materials import LAWS, Material, material, named_materials, single_mu
 from mitsonar.arrays import DeviceArray
 from mitsonar.errors import MitsonarError
 from mitsonar.plugins.hashed_texture import number_of_property
@@ -33,7 +34,8 @@ class AcousticMaterial(mi.BSDF):
     Properties: ``material``: a name, or a YAML file (relative to the scene's folder), or ``none``, which gives a plain
     ``diffuse`` whose reflectance is the reflectivity; ``reflectance`` [0.5]: a texture or number. ``reflectance_mean`` [the
     mean of the texture]: what the reflectance is divided by for sonars; required for ``mesh_attribute``. ``level_db`` [0]:
-    added to the scattering strength of the material; ``mi.traverse`` shows it, with derivatives.
+    added to the scattering strength of the material. ``mi.traverse`` shows it and the constants of the law, such as
+    ``mu`` or ``density_ratio``, with derivatives.
 
     Cameras see a diffuse surface of that reflectance, from both sides. For sonars only its relative variation matters: it is
     divided by its mean, and multiplies the cross-section. A plain number therefore affects only camera images.
@@ -59,7 +61,8 @@ class AcousticMaterial(mi.BSDF):
         self.given_mean = number_of_property(props, "reflectance_mean", 0.0)
         self.mean = _mean(self.reflectance, self.given_mean)
         self.level_db = mi.Float(number_of_property(props, "level_db", 0.0))
-        self.mu = min(max(single_mu(self.material), FAINTEST), LOUDEST)
+        self.constants = {name: mi.Float(_constant(self.material, name)) for name in _constants_of(self.material)}
+        self.mu = _single_reflectivity(self.material)
         shown = {"type": "twosided", "below": {"type": "diffuse", "reflectance": self.reflectance}}
         self.shown = cast(mi.BSDF, load_dict(shown))
         self.m_components = [self.shown.flags(index) for index in range(self.shown.component_count())]
@@ -101,17 +104,45 @@ class AcousticMaterial(mi.BSDF):
         return self.shown.eval_pdf(ctx, si, wo, active)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Expose the reflectance and the level to ``mi.traverse``."""
+        """Expose the reflectance, the level and the constants of the law to ``mi.traverse``."""
         callback.put("reflectance", self.reflectance, mi.ParamFlags.Differentiable)
         callback.put("level_db", self.level_db, mi.ParamFlags.Differentiable)
+        for name, constant in self.constants.items():
+            callback.put(name, constant, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-        """Update the mean of the reflectance after a change."""
+        """Update the mean of the reflectance and the law after a change.
+
+        Raises:
+            MitsonarError: a constant outside its limits.
+        """
         self.mean = _mean(self.reflectance, self.given_mean)
+        changed: dict[str, Any] = {}
+        for name, constant in self.constants.items():
+            values, given = np.array(dr.detach(constant), dtype=np.float64), _constant(self.material, name)
+            if values.astype(np.float32).tolist() != np.asarray(given, dtype=np.float32).tolist():
+                changed[name] = tuple(values.tolist()) if name == "strength_db" else float(values[0])
+        if changed:
+            self.material = Material(**{**self.material.model_dump(), **changed})
+            self.mu = _single_reflectivity(self.material)
 
     def to_string(self) -> str:
         """Return one line for Mitsuba's logs."""
         return f"AcousticMaterial[material = {self.material.name}, reflectance = {self.reflectance}]"
+
+
+def _constants_of(material: Material) -> list[str]:
+    """Return the names of the numbers that determine the scattering of a material."""
+    return [*LAWS[material.law], *(["roughness_m"] if material.has_mirror else [])]
+
+
+def _constant(material: Material, name: str) -> list[float]:
+    given = getattr(material, name)
+    return list(given) if isinstance(given, tuple) else [float(given)]
+
+
+def _single_reflectivity(material: Material) -> float:
+    return min(max(single_mu(material), FAINTEST), LOUDEST)
 
 
 def _material(name: str) -> Material:

@@ -9,6 +9,7 @@ from typing import cast
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from mitsonar.acoustics.materials import FLATTEST, Material, mu_table, normal_mu, reference_hz
 from mitsonar.arrays import DeviceArray
@@ -22,24 +23,60 @@ ENTRIES = 91
 """Number of pairs per material: 90 of a value and its change to the next degree, and one with the power of the sine."""
 
 
+RELATIVE_STEP, LEAST_STEP = 1e-4, 1e-6
+"""Steps of the differences that give the derivatives of laws by their constants, in float64: relative, and at least."""
+
+
 def law_rows(materials: Sequence[AcousticMaterial], sonar: Sonar) -> mi.Float:
     """Return the laws of materials for one sonar, relative to the single reflectivity that each has without a law.
+
+    They carry derivatives by those constants of a material that have any.
 
     Args:
         materials: one BSDF per material.
         sonar: sonar of the models ``physical`` or ``coherent``, or of ``thesis``, which has no laws.
     """
-    rows = np.zeros((len(materials), ENTRIES, 2))
-    for row, one in zip(rows, materials, strict=True):
-        frequency = sonar.frequency_hz or reference_hz(one.material)
-        if sonar.model == "thesis":
-            row[:90, 0] = normal_mu(one.material, frequency, sonar.sound_speed) / one.mu
-            row[90, 0] = 2
-            continue
-        table = mu_table(one.material, frequency, sonar.sound_speed)
-        row[:90, 0], row[:90, 1] = table.values[:-1] / one.mu, np.diff(table.values) / one.mu
-        row[90, 0] = table.power
-    return mi.Float(rows.ravel().tolist())
+    rows = [_row(one.material, one.mu, sonar) for one in materials]
+    laws = mi.Float(np.concatenate(rows).tolist())
+    for number, one in enumerate(materials):
+        for name, constant in one.constants.items():
+            if dr.grad_enabled(constant):
+                change = _change(one, name, constant, sonar)
+                dr.scatter_add(laws, change, dr.arange(mi.UInt32, 2 * ENTRIES) + 2 * ENTRIES * number)
+    return laws
+
+
+def _row(material: Material, mu: float, sonar: Sonar) -> NDArray[np.float64]:
+    """Return the row of a material relative to a single reflectivity, flat ``(2 ENTRIES,)``."""
+    row = np.zeros((ENTRIES, 2))
+    frequency = sonar.frequency_hz or reference_hz(material)
+    if sonar.model == "thesis":
+        row[:90, 0] = normal_mu(material, frequency, sonar.sound_speed) / mu
+        row[90, 0] = 2
+        return row.ravel()
+    table = mu_table(material, frequency, sonar.sound_speed)
+    row[:90, 0], row[:90, 1] = table.values[:-1] / mu, np.diff(table.values) / mu
+    row[90, 0] = table.power
+    return row.ravel()
+
+
+def _change(bsdf: AcousticMaterial, name: str, constant: mi.Float, sonar: Sonar) -> mi.Float:
+    """Return what is added to the row of a material: 0, with the derivatives by one of its constants."""
+    given = np.atleast_1d(np.asarray(getattr(bsdf.material, name), dtype=np.float64))
+    change = dr.zeros(mi.Float, 2 * ENTRIES)
+    for index, number in enumerate(given):
+        step = max(abs(number) * RELATIVE_STEP, LEAST_STEP)
+        above, below = (_row(_changed(bsdf.material, name, index, number + by), bsdf.mu, sonar) for by in (step, -step))
+        value = dr.gather(mi.Float, constant, mi.UInt32(index))
+        change += mi.Float(((above - below) / (2 * step)).tolist()) * (value - dr.detach(value))
+    return change
+
+
+def _changed(material: Material, name: str, index: int, number: float) -> Material:
+    """Return a material with another constant, also just outside the limits of a file's."""
+    given = getattr(material, name)
+    value = (*given[:index], number, *given[index + 1 :]) if isinstance(given, tuple) else number
+    return material.model_copy(update={name: value})
 
 
 def mirror_rows(materials: Sequence[Material]) -> mi.Float:

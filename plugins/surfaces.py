@@ -200,8 +200,14 @@ class Surfaces:
             return self
         laws = law_rows(self.materials, sonar)
         dr.eval(laws)
-        notes = frequency_notes([one.material for one in self.materials], sonar.frequency_hz, sonar.sound_speed)
+        materials = list(dict.fromkeys(one.material for one in self.materials))
+        notes = frequency_notes(materials, sonar.frequency_hz, sonar.sound_speed)
         return replace(self, laws=laws, lawful=True, notes=[*self.notes, *notes])
+
+    def renew_laws(self, sonar: Sonar) -> None:
+        """Evaluate the laws again, whose constants may have changed or have derivatives now."""
+        if self.lawful:
+            self.laws = law_rows(self.materials, sonar)
 
     def mirror(self, material: DeviceArray) -> tuple[DeviceArray, DeviceArray]:
         """Return the reflection coefficient at normal incidence and rms height [m] of materials; 0 for number -1."""
@@ -322,11 +328,14 @@ def _fixed_reflectivity(shape: mi.Shape, kinds: set[str], named: dict[str, list[
 
 
 def _number_of_material(shape: mi.Shape, materials: list[AcousticMaterial]) -> int:
-    """Return the number of a shape's material, which is appended to ``materials`` unless an equal one is present."""
+    """Return the number of a shape's material, which is appended to ``materials`` unless it is present.
+
+    Equal materials of different BSDFs have numbers of their own, since each has constants that may change.
+    """
     shape_material = material_of(shape)
     assert shape_material is not None
     for number, known in enumerate(materials):
-        if shape_material.material == known.material:
+        if shape_material is known:
             return number
     materials.append(shape_material)
     return len(materials) - 1

@@ -92,7 +92,8 @@ class AttachedLevels:
             given: properties of the instrument in place of those of the sonar.
         """
         lines = to_world(pose)
-        # 1. Trace one echo for each ray.
+        # 1. Trace one echo for each ray, over materials as they are now.
+        self.tracer.surfaces.renew_laws(self.traced)
         tracer, key = self.tracer, dr.opaque(mi.UInt32, self.tracer.sensor.key(ping))
         rays = Rays(self.traced, Rays.numbered(self.traced, 1))
         fan = tracer.sensor.fan(rays.column, rays.row, key).carried(lines)

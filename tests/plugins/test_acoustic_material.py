@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import yaml
-from helpers import MitsubaDict, diffuse, essence, floor, scene
+from helpers import Array, MitsubaDict, diffuse, essence, floor, scene
 
 import mitsonar
 from mitsonar.acoustics.materials import GRAZING_DEG, material, mu_at, mu_table, sigma_at, sigma_table, single_mu
@@ -191,6 +191,93 @@ def test_levels_of_images_follow_the_level_of_a_material() -> None:
     dr.forward(params[key])
     image = np.array(levels)
     np.testing.assert_allclose(np.array(dr.grad(levels)), image * math.log(10) / 10, rtol=1e-4, atol=1e-9 * image.max())
+
+
+CONSTANTS = {
+    "density_ratio": ("mud", 0.05),
+    "sound_speed_ratio": ("mud", 0.01),
+    "loss": ("mud", 0.001),
+    "volume": ("mud", 0.0005),
+    "spectral_exponent": ("mud", 0.02),
+    "spectral_strength": ("mud", 1e-6),
+    "mu": ("sand-mhz", 0.001),
+    "roughness_m": ("steel", 1e-5),
+}
+"""Constants of laws with a material that has them, and the step of a difference."""
+
+
+@pytest.mark.parametrize("name", essence(CONSTANTS, "spectral_exponent", "mu"))
+def test_levels_of_images_follow_the_constants_of_a_law(name: str) -> None:
+    """The derivative is that of a difference between images with other constants, also after a step."""
+    material, step = CONSTANTS[name]
+    loaded = scene(f=floor(made_of(material)))
+    simulator = mitsonar.DifferentiableSimulator(loaded, SONAR.replace(model="physical", jitter=False), edge_points=0)
+    params, pose = mi.traverse(loaded), [0, 0, 3.0, math.radians(40), 0, 0]
+    key = next(key for key, _ in params if key.endswith(f".{name}"))
+    begin = float(params[key][0])
+
+    def image_at(value: float) -> Array:
+        params[key] = mi.Float(value)
+        params.update()
+        return np.array(simulator.levels(pose), dtype=np.float64)
+
+    expected = (image_at(begin + step) - image_at(begin - step)) / (2 * step)
+    params[key] = mi.Float(begin)
+    dr.enable_grad(params[key])
+    params.update()
+    levels = simulator.levels(pose)
+    dr.forward(params[key])
+    result = np.array(dr.grad(levels), dtype=np.float64)
+    assert np.abs(expected).max() > 0
+    np.testing.assert_allclose(result, expected, rtol=0.01, atol=2e-3 * np.abs(expected).max())
+
+
+def test_strengths_of_a_tabulated_law_have_derivatives(steep: Path) -> None:
+    """One decibel more at every angle is one decibel more of the image; each cell depends on the angles that it sees."""
+    loaded = scene(f=floor(made_of(steep)))
+    simulator = mitsonar.DifferentiableSimulator(loaded, SONAR.replace(model="physical", jitter=False), edge_points=0)
+    params = mi.traverse(loaded)
+    key = next(key for key, _ in params if key.endswith("strength_db"))
+    dr.enable_grad(params[key])
+    params.update()
+    levels = simulator.levels([0, 0, 3.0, math.radians(40), 0, 0])
+    dr.backward(dr.sum(levels))
+    by_angle = np.array(dr.grad(params[key]))
+    assert by_angle.sum() == pytest.approx(math.log(10) / 10 * np.array(levels).sum(), rel=1e-3)
+    assert np.flatnonzero(by_angle).min() >= 30  # grazing angles of the ranges 4 to 6 m from a height of 3 m
+    assert np.flatnonzero(by_angle).max() <= 49
+
+
+def test_equal_materials_have_constants_of_their_own() -> None:
+    """Two halves of a floor, which differ for cameras only: the image depends on each by a constant of its own."""
+    place = mi.ScalarTransform4f()
+    halves = [
+        {**floor(made_of("mud", reflectance=0.4 + 0.1 * k)), "to_world": place.translate([6 * k - 3, 3, 0]).scale(3)}
+        for k in range(2)
+    ]
+    loaded = scene(port=halves[0], starboard=halves[1])
+    simulator = mitsonar.DifferentiableSimulator(loaded, SONAR.replace(model="physical", jitter=False), edge_points=0)
+    params, pose, parts = mi.traverse(loaded), [0, 0, 3.0, math.radians(40), 0, 0], []
+    for key in ("port.bsdf.volume", "starboard.bsdf.volume"):
+        dr.enable_grad(params[key])
+        params.update()
+        levels = simulator.levels(pose)
+        dr.forward(params[key])
+        parts.append(np.array(dr.grad(levels)).sum(axis=0))
+        dr.disable_grad(params[key])
+    port, starboard = parts
+    assert (port[:5] > 0).all()
+    assert (starboard[:5] == 0).all()
+    assert (starboard[7:] > 0).all()
+    assert (port[7:] == 0).all()
+
+
+def test_constants_outside_their_limits_are_refused() -> None:
+    params = mi.traverse(scene(f=floor(made_of("mud"))))
+    key = next(key for key, _ in params if key.endswith("density_ratio"))
+    params[key] = mi.Float(0.1)
+    with pytest.raises(MitsonarError, match=r"density_ratio.*0\.5.*got 0\.1"):
+        params.update()
 
 
 def test_materials_and_other_surfaces_side_by_side() -> None:
