@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import Command, refused
+from helpers import Command, Done, refused
 
 from mitsonar.acoustics.water import Water, absorption_db_per_m
 from mitsonar.motion.pose import Pose
@@ -51,6 +51,35 @@ def test_it_writes_what_it_promises_and_continues_where_it_was_interrupted(mitso
     again = mitsonar("sas", "flat_floor", *ENDS, *SMALL, "-o", half, "--resume")
     assert again.returncode == 0, again.stderr
     np.testing.assert_array_equal(StripImage.load(half / "image.npz").value, image.value)
+
+
+TANK = """<scene version="3.0.0">
+    <shape type="rectangle" id="floor"><transform name="to_world"><scale value="8"/></transform>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.05"/></bsdf></shape>
+    <shape type="sphere" id="float"><float name="radius" value="0.2"/>
+        <bsdf type="diffuse"><rgb name="reflectance" value="0.9"/></bsdf></shape>
+</scene>"""
+
+
+def test_a_body_is_where_its_path_says(mitsonar: Command, tmp_path: Path) -> None:
+    """A float that rests 3.5 m abeam of the middle of the track; the same run is not resumed with another path."""
+    (tmp_path / "tank.xml").write_text(TANK)
+    for name, y in (("here", 0.0), ("there", 0.5)):
+        Trajectory(np.array([[3.5, y, 0.2, 0, 0, 0]]), np.zeros(1)).save(tmp_path / f"{name}.tum")
+
+    def run(path: str, *more: str) -> Done:
+        moving = ("--moving", f"float={tmp_path / path}.tum")
+        return mitsonar("sas", tmp_path / "tank.xml", *ENDS, *SMALL, *moving, *more, "-o", tmp_path / "out")
+
+    done = run("here")
+    assert done.returncode == 0, done.stderr
+    image = StripImage.load(tmp_path / "out" / "image.npz")
+    along, across = np.meshgrid(image.grid.along_m - 1.2, image.grid.across_m, indexing="ij")  # from the middle
+    power = np.abs(image.value) ** 2
+    near = np.hypot(along, across - 3.4) < 0.3  # its near side appears a little nearer, since it stands above the ground
+    assert power[near].mean() > 5 * power[(np.abs(along) > 0.35) & (np.abs(across - 3.4) < 0.3)].mean()
+    refused(run("there", "--resume"), "moving")
+    refused(mitsonar("sas", tmp_path / "tank.xml", *ENDS, *SMALL, "--moving", f"boat={tmp_path / 'here.tum'}"), "boat")
 
 
 def test_another_navigation_is_corrected(mitsonar: Command, tmp_path: Path) -> None:
