@@ -487,18 +487,23 @@ class GroundProblem:
         return 1 / max(float(np.square(residual).mean()), 1e-9)
 
     def scores(self, solutions: Sequence[GroundSolution], looks: Sequence[float]) -> list[tuple[float, float]]:
-        """Return log likelihood per block and rms error [dB] of solutions on these frames, without common outliers.
+        """Return log likelihood per block and rms error [dB] of solutions on these frames.
 
-        The logarithm of a mean of L looks of a Gamma law has the variance trigamma(L), so the rms error has a floor.
+        Blocks count that no solution takes for an outlier, or for ground beyond its pattern: the sharper the law of a
+        solution, the more a stone would count against it. The logarithm of a mean of L looks of a Gamma law has the variance
+        trigamma(L), so the rms error has a floor.
         """
         means = [self.means(one.values, one.gain_db)[0][self.view_of] for one in solutions]
-        shown = self.mean_of_frame
-        used = self.valid_of_frame
-        inside = np.zeros(used.shape, dtype=bool)
+        shown, used = self.mean_of_frame, self.valid_of_frame
+        for one in solutions:
+            used = used & self.within_pattern(one.values)[self.view_of]
+        if not used.any():
+            return [(math.nan, math.nan)] * len(solutions)
+        inside = np.ones(used.shape, dtype=bool)
         for mean in means:
             error = np.log(np.where(used, shown, 1.0) / mean)
             middle = np.median(error[used])
-            inside |= np.abs(error - middle) <= OUTLIER * 1.4826 * np.median(np.abs(error[used] - middle))
+            inside &= np.abs(error - middle) <= OUTLIER * 1.4826 * np.median(np.abs(error[used] - middle))
         used = used & inside
         scores = []
         for mean, one in zip(means, looks, strict=True):
