@@ -92,6 +92,16 @@ def test_a_sonar_that_looks_down_turns_as_the_vehicle_rolls() -> None:
     np.testing.assert_allclose(on_sonar.heading.values[1:-1], expected.heading.values[1:-1], atol=4e-4)  # type: ignore[union-attr]
 
 
+def test_turns_are_corrected_where_pitch_and_roll_both_have_readings() -> None:
+    """A log whose roll ends before its pitch, and its gyroscope after both: beyond, the roll stays as it is."""
+    time = np.arange(0, 20, 0.1)
+    pitch, roll = (readings(time[:count], 0.1 * np.sin(time[:count]), 1e-3) for count in (180, 150))
+    sensors = VehicleSensors(yaw_rate=readings(time, 0 * time, 1e-4), pitch=pitch, roll=roll).on_mount(0.4)
+    assert sensors.yaw_rate is not None
+    assert np.abs(sensors.yaw_rate.values[:149]).max() > 0.01
+    np.testing.assert_array_equal(sensors.yaw_rate.values[150:], 0)
+
+
 def test_frames_take_height_and_attitude_from_the_sensors_of_a_vehicle() -> None:
     vehicle, sonar = rolling()
     sensors = simulated_sensors(vehicle, SensorNoise(depth_m=1e-9, attitude_deg=1e-9, rate_hz=50.0))
