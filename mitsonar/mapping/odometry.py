@@ -154,9 +154,10 @@ def odometry(
     # 1. select the frames, and reject impossible options before hours of estimating
     source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
     estimator, sensors = create_estimator(estimator), options.sensors
-    if sensors is not None and isinstance(source, FrameSource):
-        source, sensors = source.with_sensors(sensors)
     numbers, shown = _frames_used(source, options)
+    if sensors is not None and shown is not None:
+        shown, sensors = shown.with_sensors(sensors)
+        source = shown
     time_s, store = source.time_s[numbers], store or EstimateStore()
     # 2. estimate the motion of each pair, and resolve ambiguous motions by their neighbours
     priors = None if sensors is None else sensors.priors(time_s)
