@@ -702,7 +702,9 @@ def follows_depth(estimates: Sequence[Estimate], rise_m: Array, name: str) -> st
     slope = float(ahead @ rise / max(float(rise @ rise), np.finfo(float).tiny))
     if abs(slope) < FOLLOWS or abs(np.corrcoef(ahead, rise)[0, 1]) < FOLLOWS_CLEARLY:
         return ""
-    cause = "check the sign of depth_m, which grows downwards" if slope > 0 else "check that depth_m is in metres"
+    # in too small a unit, such as feet, a rise that is taken out too often looks like one of the wrong sign
+    sign = "the sign of depth_m, which grows downwards, and " if slope > 0 else ""
+    cause = f"check {sign}that {'it' if sign else 'depth_m'} is in metres"
     return f"motions ahead follow the depth of {name}, by {slope:.2g} m for each metre that it rises: {cause}"
 
 

@@ -493,7 +493,10 @@ def test_a_roll_of_the_wrong_sign_is_named() -> None:
         assert ("vehicle_roll_deg seems to have the wrong sign" in sentence) == (sign < 0)
 
 
-@pytest.mark.parametrize(("slope", "cause"), [(0.87, "the sign of depth_m"), (-0.44, "in metres"), (0.02, ""), (0.0, "")])
+@pytest.mark.parametrize(
+    ("slope", "cause"),
+    [(0.87, "the sign of depth_m"), (0.3, "in metres"), (-0.44, "check that depth_m is in metres"), (0.02, ""), (0.0, "")],
+)
 def test_motions_that_follow_the_depth_are_doubted(slope: float, cause: str) -> None:
     rng = np.random.default_rng(4)
     rise = 0.1 * np.sin(np.arange(40) / 3)
