@@ -989,7 +989,10 @@ def _altimeter(source: Source, frames: Index) -> Array:
         return np.full(len(frames), np.nan)
     heights = np.asarray(source.height_m[frames], dtype=float)
     given = np.nan if source.given_height_m is None else source.given_height_m
-    return np.where(heights == given, np.nan, heights)
+    by_user = heights == given
+    if isinstance(source, FrameSource) and source.rise_m is not None:  # which `with_sensors` adds to a given height
+        by_user |= heights == (given + source.rise_m - source.rise_m.mean())[frames]
+    return np.where(by_user, np.nan, heights)
 
 
 def _ahead(source: Source, frames: Index, height_m: Array) -> Array:
