@@ -182,7 +182,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
         given: known fields, which replace those of the base.
 
     Raises:
-        MitsonarError: frames that are too small or empty, or fields that the model coherent lacks.
+        MitsonarError: frames that are too small, empty or not finite, or fields that the model coherent lacks.
     """
     _check(frames)
     # 1. geometry and coding from the frames, everything else from the base
@@ -282,13 +282,15 @@ def _water(flat: Array, level: Array, noise: float, sonar: Sonar, full_scale_db:
 
 
 def _check(frames: SonarFrames) -> None:
-    """Raise an error for frames that are too small, or that do not vary."""
+    """Raise an error for frames that are too small, not finite, or that do not vary."""
     shape = frames.image.shape
     if len(frames) == 0 or shape[1] < LEAST_SHAPE[0] or shape[2] < LEAST_SHAPE[1]:
         raise MitsonarError(
             f"a fit needs at least one frame of {LEAST_SHAPE[0]} bins x {LEAST_SHAPE[1]} beams: got "
             f"{shape[0]} of {shape[1]} x {shape[2]}; record a longer or wider window"
         )
+    if not np.isfinite(frames.image).all():
+        raise MitsonarError("a fit needs finite levels: the frames hold nan or inf; set cells without echo to 0")
     if not np.ptp(frames.image):
         raise MitsonarError("a fit needs frames that vary: all cells have the same value; give frames with echoes")
 

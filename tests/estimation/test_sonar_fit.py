@@ -232,6 +232,9 @@ def test_frames_that_tell_nothing_are_refused() -> None:
     varied = np.random.default_rng(0).exponential(0.05, (2, 128, 32)).clip(0, 1)
     with pytest.raises(MitsonarError, match="needs the carrier: give frequency_hz"):
         fit_sonar(blank(value=varied))
+    varied[1, 40, 7] = np.nan
+    with pytest.raises(MitsonarError, match="needs finite levels: the frames hold nan or inf"):
+        fit_sonar(blank(value=varied), frequency_hz=1.8e6)
 
 
 def test_the_command_writes_what_the_simulator_reads(
