@@ -218,6 +218,18 @@ def test_unstated_ping_groups(recordings: dict[str, SonarFrames]) -> None:
     assert fit_sonar(frames, base).sonar.ping_groups == 8  # the recording states it, the base does not
 
 
+def test_crosstalk_shows_in_the_group_of_a_narrow_target() -> None:
+    """A target one beam wide: seven of eight groups have no strong echo, and nothing to say about the leak."""
+    sonar = Sonar.create(beams=96, range_bins=400, ping_groups=8)
+    rng = np.random.default_rng(0)
+    echo, group = rng.exponential(size=(4, 400, 96)), np.arange(96) % 8
+    strong = 1e5 * (1 + 3 * rng.exponential(size=(4, 16)))
+    echo[:, 40:360:20, 43] += strong
+    echo[:, 40:360:20, group == 3] += 10**-4.5 * strong[..., None] * rng.exponential(size=(4, 16, 12))
+    frames = SonarFrames((echo / echo.max()).astype(np.float32), sonar.range_m, sonar.bearing_rad, np.arange(4.0), sonar)
+    assert fit_sonar(frames, frequency_hz=1.8e6).sonar.crosstalk_db == pytest.approx(-45, abs=2)
+
+
 def blank(bins: int = 128, beams: int = 32, value: Array | float = 0.5) -> SonarFrames:
     sonar = Sonar.create(beams=beams, range_bins=bins)
     image = np.zeros((2, bins, beams), np.float32) + np.float32(value)
