@@ -156,7 +156,7 @@ def odometry(
     estimator, sensors = create_estimator(estimator), options.sensors
     numbers, shown = _frames_used(source, options)
     if sensors is not None and shown is not None:
-        shown, sensors = shown.with_sensors(sensors)
+        shown, sensors = shown.with_sensors(sensors, options.every)
         source = shown
     time_s, store = source.time_s[numbers], store or EstimateStore()
     # 2. estimate the motion of each pair, and resolve ambiguous motions by their neighbours

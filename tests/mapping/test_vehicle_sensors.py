@@ -521,6 +521,11 @@ def test_a_gyroscope_without_the_roll_of_the_vehicle_counts_little() -> None:
     (measured,) = widened.motions(time_s)
     turn = math.tan(math.radians(25)) * math.radians(4) * 0.2
     np.testing.assert_allclose(np.sqrt(measured.covariances[:, 2, 2]), turn, rtol=1e-3)
+    # of every third frame, a motion takes three times as long
+    with pytest.warns(MitsonarWarning, match=r"by some 1\.1 deg in a motion"):
+        _, seldom = source.with_sensors(sensors, 3)
+    (measured,) = seldom.motions(time_s[::3])
+    np.testing.assert_allclose(np.sqrt(measured.covariances[:, 2, 2]), 3 * turn, rtol=1e-3)
     _, level = replace(source, pitch_rad=0.0).with_sensors(sensors)
     np.testing.assert_array_equal(level.yaw_rate.std, sensors.yaw_rate.std)  # type: ignore[union-attr]
 
