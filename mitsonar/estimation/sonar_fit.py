@@ -194,7 +194,8 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     value = np.asarray(frames.image, dtype=float) / (255 if frames.image.dtype.kind == "u" else 1)
     notes: list[str] = []
     # 2. the grain of dark windows gives a coding; with it, values become intensities. Ping groups precede the beam width.
-    clipped = _inside(statistics.window_values(value)).sum() < LEAST_WINDOWS
+    inside = _inside(statistics.window_values(value))
+    clipped = inside.sum() < min(LEAST_WINDOWS, len(inside))
     span = gamma = None
     if clipped:
         share = 100 * float(((value <= 0) | (value >= FULL_SCALE)).mean())

@@ -236,6 +236,14 @@ def blank(bins: int = 128, beams: int = 32, value: Array | float = 0.5) -> Sonar
     return SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.arange(2.0), sonar)
 
 
+def test_one_small_frame_is_not_called_clipped() -> None:
+    sonar = Sonar.create(beams=16, range_bins=96, coding="dB")
+    level = 10 * np.log10(np.random.default_rng(2).exponential(size=(1, 96, 16))) / 80 + 0.6
+    fit = fit_sonar(SonarFrames(level, sonar.range_m, sonar.bearing_rad, np.zeros(1), sonar, level="dB"), frequency_hz=1.8e6)
+    assert fit.speckle_span_db == pytest.approx(80, rel=0.2)
+    assert not any("clipped" in one for one in (*fit.notes, *fit.lines()))
+
+
 def test_frames_that_tell_nothing_are_refused() -> None:
     with pytest.raises(MitsonarError, match="at least one frame of 96 bins x 16 beams: got 2 of 64 x 32"):
         fit_sonar(blank(bins=64))
