@@ -159,5 +159,6 @@ def _posed(
     if source.sonar_poses is None and path is None:  # one frame, above the origin
         poses[:, 2] = below if height_m is None else height_m
         return index, poses, poses[:, 2].copy()
-    ground = (poses[:, 2] - below).min() if height_m is None else poses[0, 2] - height_m
+    known = np.isfinite(below)  # beyond the edge of the scene, nothing is below
+    ground = poses[0, 2] - height_m if height_m is not None else (poses[known, 2] - below[known]).min(initial=np.inf)
     return index, poses, np.asarray(poses[:, 2] - ground, dtype=np.float64)

@@ -118,8 +118,6 @@ def calibrate_sonar(
         MitsonarError: frames that :func:`.fit_sonar` refuses; a sonar without a pattern over elevation; frames that do not
             show level ground above the noise.
     """
-    if not np.isfinite(frames.image).all():
-        raise MitsonarError("a calibration needs finite levels: the frames hold nan or inf; set cells without echo to 0")
     fit = fit_sonar(frames, base, **given)
     sonar = fit.sonar.replace(**given)
     if sonar.vertical_pattern == "box":
@@ -131,7 +129,7 @@ def calibrate_sonar(
     if "gain_exponent" in given:
         known["range_exponent"] = 0.0
     fixed = {name: float(value) for name, value in known.items() if value is not None}
-    if fixed.get("height_m", 1.0) <= 0:
+    if not fixed.get("height_m", 1.0) > 0:
         raise MitsonarError(f"the height must be positive: got {height_m:g} m; give the height over the ground")
     # 1. All frames give the result.
     reference = reference_of(frames)

@@ -182,7 +182,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
         given: known fields, which replace those of the base.
 
     Raises:
-        MitsonarError: frames that are too small or empty, or fields that the model coherent lacks.
+        MitsonarError: frames that are too small, empty or not finite, or fields that the model coherent lacks.
     """
     _check(frames)
     # 1. geometry and coding from the frames, everything else from the base
@@ -194,7 +194,8 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     value = np.asarray(frames.image, dtype=float) / (255 if frames.image.dtype.kind == "u" else 1)
     notes: list[str] = []
     # 2. the grain of dark windows gives a coding; with it, values become intensities. Ping groups precede the beam width.
-    clipped = _inside(statistics.window_values(value)).sum() < LEAST_WINDOWS
+    inside = _inside(statistics.window_values(value))
+    clipped = inside.sum() < min(LEAST_WINDOWS, len(inside))
     span = gamma = None
     if clipped:
         share = 100 * float(((value <= 0) | (value >= FULL_SCALE)).mean())
@@ -223,7 +224,8 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     # 4. a rise of quiet beams of the same ping next to a strong echo is crosstalk
     limit, group = float(decoded(FULL_SCALE, sonar)), group_of_beams(sonar)
     parts = [intensity[:, statistics.GLOW_BINS :, group == one] for one in range(sonar.ping_groups)]
-    leak = float(np.mean([statistics.leak_power(part, limit) for part in parts]))
+    leaks = [one for part in parts if (one := statistics.leak_power(part, limit)) > 0]  # 0 in groups without strong echoes
+    leak = float(np.mean(leaks)) if leaks else 0.0
     stripes = statistics.stripes_by_group_db(level, group)
     fitted: dict[str, Any] = {
         **{"near_glow_db": 0.0, "near_glow_edge_db": 0.0, "near_glow_spread_db": 0.0, "near_glow_still": 0.0},
@@ -282,13 +284,15 @@ def _water(flat: Array, level: Array, noise: float, sonar: Sonar, full_scale_db:
 
 
 def _check(frames: SonarFrames) -> None:
-    """Raise an error for frames that are too small, or that do not vary."""
+    """Raise an error for frames that are too small, not finite, or that do not vary."""
     shape = frames.image.shape
     if len(frames) == 0 or shape[1] < LEAST_SHAPE[0] or shape[2] < LEAST_SHAPE[1]:
         raise MitsonarError(
             f"a fit needs at least one frame of {LEAST_SHAPE[0]} bins x {LEAST_SHAPE[1]} beams: got "
             f"{shape[0]} of {shape[1]} x {shape[2]}; record a longer or wider window"
         )
+    if not np.isfinite(frames.image).all():
+        raise MitsonarError("a fit needs finite levels: the frames hold nan or inf; set cells without echo to 0")
     if not np.ptp(frames.image):
         raise MitsonarError("a fit needs frames that vary: all cells have the same value; give frames with echoes")
 

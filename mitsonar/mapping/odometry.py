@@ -154,9 +154,10 @@ def odometry(
     # 1. select the frames, and reject impossible options before hours of estimating
     source = FrameSource.of(frames) if isinstance(frames, SonarFrames) else frames
     estimator, sensors = create_estimator(estimator), options.sensors
-    if sensors is not None and isinstance(source, FrameSource):
-        source, sensors = source.with_sensors(sensors)
     numbers, shown = _frames_used(source, options)
+    if sensors is not None and shown is not None:
+        shown, sensors = shown.with_sensors(sensors, options.every)
+        source = shown
     time_s, store = source.time_s[numbers], store or EstimateStore()
     # 2. estimate the motion of each pair, and resolve ambiguous motions by their neighbours
     priors = None if sensors is None else sensors.priors(time_s)
@@ -701,7 +702,9 @@ def follows_depth(estimates: Sequence[Estimate], rise_m: Array, name: str) -> st
     slope = float(ahead @ rise / max(float(rise @ rise), np.finfo(float).tiny))
     if abs(slope) < FOLLOWS or abs(np.corrcoef(ahead, rise)[0, 1]) < FOLLOWS_CLEARLY:
         return ""
-    cause = "check the sign of depth_m, which grows downwards" if slope > 0 else "check that depth_m is in metres"
+    # in too small a unit, such as feet, a rise that is taken out too often looks like one of the wrong sign
+    sign = "the sign of depth_m, which grows downwards, and " if slope > 0 else ""
+    cause = f"check {sign}that {'it' if sign else 'depth_m'} is in metres"
     return f"motions ahead follow the depth of {name}, by {slope:.2g} m for each metre that it rises: {cause}"
 
 
@@ -986,7 +989,10 @@ def _altimeter(source: Source, frames: Index) -> Array:
         return np.full(len(frames), np.nan)
     heights = np.asarray(source.height_m[frames], dtype=float)
     given = np.nan if source.given_height_m is None else source.given_height_m
-    return np.where(heights == given, np.nan, heights)
+    by_user = heights == given
+    if isinstance(source, FrameSource) and source.rise_m is not None:  # which `with_sensors` adds to a given height
+        by_user |= heights == (given + source.rise_m - source.rise_m.mean())[frames]
+    return np.where(by_user, np.nan, heights)
 
 
 def _ahead(source: Source, frames: Index, height_m: Array) -> Array:

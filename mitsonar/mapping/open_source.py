@@ -478,8 +478,8 @@ def _responses_for(where: str, reading: Reading) -> ResponseSource:
 
 
 def _has_height(source: FrameSource) -> bool:
-    """Return whether all frames have a height, given or measured."""
-    return source.altimeter is not None or (source.height_m is not None and bool(np.isfinite(source.height_m).all()))
+    """Return whether frames have heights, given or measured; an altimeter may miss some, whose motions are bridged."""
+    return source.altimeter is not None or (source.height_m is not None and bool(np.isfinite(source.height_m).any()))
 
 
 def _with_contrast(source: FrameSource, reading: Reading, *, bare: bool) -> FrameSource:

@@ -243,10 +243,14 @@ class FrameSource:
             pitch_rad=pitch_rad if self.pitch_rad is None else self.pitch_rad,
         )
 
-    def with_sensors(self, sensors: VehicleSensors) -> tuple[Self, VehicleSensors]:
+    def with_sensors(self, sensors: VehicleSensors, every: int = 1) -> tuple[Self, VehicleSensors]:
         """Return the same frames with the rise and the attitude that a vehicle's sensors measured, if they lack them.
 
         A given height is then the mean over the run, and a given pitch that of the mount.
+
+        Args:
+            sensors: sensors of the vehicle.
+            every: number of frames from one that is used to the next, over which an unknown roll turns the sonar.
 
         Returns:
             The frames, and the sensors in the axes of the sonar.
@@ -272,7 +276,7 @@ class FrameSource:
             leans = np.column_stack([std[:, 0], np.full((len(self), 2), usual * (self.pitch_rad is not None))])
             aided = replace(self, rise_m=rise, height_m=heights, attitude_std=leans)
         if lean is None:
-            return aided, self._with_unknown_roll(sensors)
+            return aided, self._with_unknown_roll(sensors, every)
         known = self.attitudes(np.arange(len(self)))
         if known is None:
             raise MitsonarError(
@@ -286,13 +290,13 @@ class FrameSource:
             return aided, sensors.on_mount(self.pitch_rad)
         return aided, sensors.on_mount(float(np.nanmean(known[:, 3] - lean[:, 0])))
 
-    def _with_unknown_roll(self, sensors: VehicleSensors) -> VehicleSensors:
+    def _with_unknown_roll(self, sensors: VehicleSensors, every: int) -> VehicleSensors:
         """Return sensors whose gyroscope has the noise of turns that the vehicle's roll gives a pitched sonar."""
         gyro = sensors.yaw_rate
         if gyro is None or self.pitch_rad is None or self.poses is not None:
             return sensors
         turn_s = abs(math.tan(self.pitch_rad)) * UNKNOWN_PER_S.roll_rad  # on a calm day
-        step_s = float(np.median(np.diff(self.time_s)))
+        step_s = every * float(np.median(np.diff(self.time_s)))
         noise = turn_s * math.sqrt(step_s)
         if noise > LARGE_NOISE * float(np.median(gyro.std)):
             warnings.warn(

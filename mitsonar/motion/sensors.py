@@ -394,12 +394,13 @@ class VehicleSensors:
         Args:
             pitch_rad: pitch of the sonar in the axes of the vehicle [rad].
         """
-        pitch = self.pitch
-        if pitch is None:
+        if self.pitch is None or self.roll is None:
             return self
+        ends = np.array([one.edges_s[[0, -1]] for one in (self.pitch, self.roll)])
+        first, last = ends[:, 0].max(), ends[:, 1].min()
 
         def turn(time_s: Array) -> Array:
-            lean = self.attitudes(np.clip(time_s, *pitch.edges_s[[0, -1]]))
+            lean = self.attitudes(np.clip(time_s, first, last))
             assert lean is not None
             return leaning_mount(lean, pitch_rad)[:, 2]
 

@@ -222,9 +222,10 @@ class ChannelTracer:
         return table if straight else mirrored_table(table, path.out, path.back, self.registry)
 
     def height_m(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the height of each pose above the surface straight below it ``(pings,)`` [m]; nan if there is none."""
+        """Return the height of each pose above the still surface straight below ``(pings,)`` [m]; nan if there is none."""
         place = mi.Point3f(*(mi.Float(padded(axis.astype(np.float32))) for axis in poses[:, :3].T))
-        return np.array(height_below(self.scene, place), dtype=float)
+        scene = self.scene if self.motion is None else self.motion.still  # where bodies are in their own axes, nothing is
+        return np.array(height_below(scene, place), dtype=float)
 
     def _compile(self, receiver: int, names: tuple[str, ...], out: int, back: int, moves: bool) -> _Launch:
         """Record a receiver's launch for the given numbers of mirrors; later calls replay it (``dr.freeze``)."""

@@ -119,3 +119,6 @@ def test_heights_are_those_over_level_ground(given: float | None, expected: list
     assert list(index) == [0, 1, 2]
     np.testing.assert_array_equal(taken, poses)
     np.testing.assert_allclose(height_m, expected)
+    # where nothing is below a frame, the other frames know the ground
+    source.height_m[1] = np.nan
+    np.testing.assert_allclose(_posed(source, np.arange(3), None, given)[2], expected)

@@ -230,8 +230,9 @@ def test_unusable_frames_are_refused() -> None:
         calibrate_sonar(replace(frames, image=image))
     with pytest.raises(MitsonarError, match="needs a pattern over elevation: got elevation_pattern box"):
         calibrate_sonar(frames, elevation_pattern="box")
-    with pytest.raises(MitsonarError, match="height must be positive: got -1 m"):
-        calibrate_sonar(frames, height_m=-1.0)
+    for height in (-1.0, np.nan):
+        with pytest.raises(MitsonarError, match=f"height must be positive: got {height:g} m"):
+            calibrate_sonar(frames, height_m=height)
     bright = np.where(np.random.default_rng(1).random(frames.image.shape) < 0.9, 1.0, frames.image).astype(np.float32)
     with pytest.raises(MitsonarError, match=r"at least 200 blocks of cells with levels: got 0 of .* 100% are clipped"):
         calibrate_sonar(replace(frames, image=bright))

@@ -218,10 +218,30 @@ def test_unstated_ping_groups(recordings: dict[str, SonarFrames]) -> None:
     assert fit_sonar(frames, base).sonar.ping_groups == 8  # the recording states it, the base does not
 
 
+def test_crosstalk_shows_in_the_group_of_a_narrow_target() -> None:
+    """A target one beam wide: seven of eight groups have no strong echo, and nothing to say about the leak."""
+    sonar = Sonar.create(beams=96, range_bins=400, ping_groups=8)
+    rng = np.random.default_rng(0)
+    echo, group = rng.exponential(size=(4, 400, 96)), np.arange(96) % 8
+    strong = 1e5 * (1 + 3 * rng.exponential(size=(4, 16)))
+    echo[:, 40:360:20, 43] += strong
+    echo[:, 40:360:20, group == 3] += 10**-4.5 * strong[..., None] * rng.exponential(size=(4, 16, 12))
+    frames = SonarFrames((echo / echo.max()).astype(np.float32), sonar.range_m, sonar.bearing_rad, np.arange(4.0), sonar)
+    assert fit_sonar(frames, frequency_hz=1.8e6).sonar.crosstalk_db == pytest.approx(-45, abs=2)
+
+
 def blank(bins: int = 128, beams: int = 32, value: Array | float = 0.5) -> SonarFrames:
     sonar = Sonar.create(beams=beams, range_bins=bins)
     image = np.zeros((2, bins, beams), np.float32) + np.float32(value)
     return SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.arange(2.0), sonar)
+
+
+def test_one_small_frame_is_not_called_clipped() -> None:
+    sonar = Sonar.create(beams=16, range_bins=96, coding="dB")
+    level = 10 * np.log10(np.random.default_rng(2).exponential(size=(1, 96, 16))) / 80 + 0.6
+    fit = fit_sonar(SonarFrames(level, sonar.range_m, sonar.bearing_rad, np.zeros(1), sonar, level="dB"), frequency_hz=1.8e6)
+    assert fit.speckle_span_db == pytest.approx(80, rel=0.2)
+    assert not any("clipped" in one for one in (*fit.notes, *fit.lines()))
 
 
 def test_frames_that_tell_nothing_are_refused() -> None:
@@ -232,6 +252,9 @@ def test_frames_that_tell_nothing_are_refused() -> None:
     varied = np.random.default_rng(0).exponential(0.05, (2, 128, 32)).clip(0, 1)
     with pytest.raises(MitsonarError, match="needs the carrier: give frequency_hz"):
         fit_sonar(blank(value=varied))
+    varied[1, 40, 7] = np.nan
+    with pytest.raises(MitsonarError, match="needs finite levels: the frames hold nan or inf"):
+        fit_sonar(blank(value=varied), frequency_hz=1.8e6)
 
 
 def test_the_command_writes_what_the_simulator_reads(

@@ -19,6 +19,7 @@ from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
 from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.motion.pose import Pose, mounted
+from mitsonar.motion.sensors import Readings, VehicleSensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
 
@@ -70,6 +71,15 @@ def test_a_height_that_is_given_is_no_measurement(source: FrameSource) -> None:
         result = profile_of(one, *[None] * 5)
         assert np.isnan(result.height_m).all()
         assert set(result.by) == {""}
+    # nor is it with the heave of a depth sensor
+    time = np.linspace(-1, 10, 200)
+    depth = VehicleSensors(depth=Readings(time, 3 + 0.1 * np.sin(time), np.full(200, 0.01)))
+    heaving, _ = replace(bare, poses=None, pitch_rad=0.4).with_geometry(2.5).with_sensors(depth)
+    assert heaving.height_m is not None
+    assert np.ptp(heaving.height_m) > 0.01
+    still = [Estimate(Motion(0.0, 0.0, 0.0))] * 5
+    assert source.true is not None
+    assert set(height_profile(heaving, np.arange(6), still, depth, source.true).by) == {""}
 
 
 @dataclass(frozen=True)

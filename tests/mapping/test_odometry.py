@@ -28,13 +28,14 @@ from mitsonar.mapping import odometry_run
 from mitsonar.mapping.loops import Canvas
 from mitsonar.mapping.odometry import OdometryOptions, errors_along, odometry
 from mitsonar.mapping.odometry_run import OdometryFolder, run_odometry, table_lines
-from mitsonar.mapping.open_source import usual_loop
+from mitsonar.mapping.open_source import usual_loop, with_assumed_plane
 from mitsonar.mapping.pairs import PAIRS_A_BATCH, EstimateStore, estimate_motions
 from mitsonar.mapping.sensors import SensorNoise, simulated_sensors
 from mitsonar.mapping.series import MotionSeries, bridged, path_of
 from mitsonar.mapping.sources import FrameSource, load_frames, open_frames
 from mitsonar.motion.composition import Motion, MotionPrior, motions
 from mitsonar.motion.pose import Pose
+from mitsonar.motion.sensors import Readings, VehicleSensors
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.recordings.write_xtf import write_xtf
 from mitsonar.records.frames import SonarFrames
@@ -373,6 +374,33 @@ def test_what_cannot_be_driven_is_said(change: str, options: dict[str, Any], mes
             frames.poses = None
     with pytest.raises(MitsonarError, match=message):
         odometry(frames, estimator, OdometryOptions(**options))
+
+
+def test_heights_of_an_altimeter_that_misses_frames_are_kept() -> None:
+    """No plane is assumed in their place; motions of frames without a height are bridged."""
+    source = FrameSource.of(over_ground(sway(6)))
+    heights = np.array([2.5, 2.5, np.nan, np.nan, 2.5, 2.5])
+    source = replace(source, poses=None, height_m=heights, pitch_rad=0.4)
+    assert with_assumed_plane(source) is source
+    result = odometry(source, "zero")
+    assert result.estimates[2].reason == "no height was found in the frames"
+    assert result.valid.tolist() == [True, True, False, True, True]
+    with pytest.warns(MitsonarWarning, match="are assumed"):
+        assert with_assumed_plane(replace(source, height_m=np.full(6, np.nan))).assumed_height
+
+
+@pytest.mark.parametrize(
+    ("time_s", "message"),
+    [([], "got 0 from"), ([1.0], "got 1 from"), ([2.0, 1.0], "increase"), ([np.nan, np.nan], "finite")],
+)
+def test_frames_without_a_path_are_refused_before_sensors_are_read(time_s: list[float], message: str) -> None:
+    frames = replace(over_ground(sway(2)), poses=None, height_m=None).select(slice(len(time_s)))
+    source = replace(FrameSource.of(frames), time_s=np.array(time_s)).with_geometry(2.2, 0.4)
+    time = np.arange(0.0, 9, 0.1)
+    one = Readings(time, 0 * time, np.full(90, 1e-4))
+    for sensors in (VehicleSensors(yaw_rate=one), VehicleSensors(yaw_rate=one, depth=one, pitch=one, roll=one)):
+        with pytest.raises(MitsonarError, match=message):
+            odometry(source, "zero", OdometryOptions(sensors=sensors))
 
 
 # ---------------------------------------------------------------- sources

@@ -92,6 +92,16 @@ def test_a_sonar_that_looks_down_turns_as_the_vehicle_rolls() -> None:
     np.testing.assert_allclose(on_sonar.heading.values[1:-1], expected.heading.values[1:-1], atol=4e-4)  # type: ignore[union-attr]
 
 
+def test_turns_are_corrected_where_pitch_and_roll_both_have_readings() -> None:
+    """A log whose roll ends before its pitch, and its gyroscope after both: beyond, the roll stays as it is."""
+    time = np.arange(0, 20, 0.1)
+    pitch, roll = (readings(time[:count], 0.1 * np.sin(time[:count]), 1e-3) for count in (180, 150))
+    sensors = VehicleSensors(yaw_rate=readings(time, 0 * time, 1e-4), pitch=pitch, roll=roll).on_mount(0.4)
+    assert sensors.yaw_rate is not None
+    assert np.abs(sensors.yaw_rate.values[:149]).max() > 0.01
+    np.testing.assert_array_equal(sensors.yaw_rate.values[150:], 0)
+
+
 def test_frames_take_height_and_attitude_from_the_sensors_of_a_vehicle() -> None:
     vehicle, sonar = rolling()
     sensors = simulated_sensors(vehicle, SensorNoise(depth_m=1e-9, attitude_deg=1e-9, rate_hz=50.0))
@@ -483,7 +493,10 @@ def test_a_roll_of_the_wrong_sign_is_named() -> None:
         assert ("vehicle_roll_deg seems to have the wrong sign" in sentence) == (sign < 0)
 
 
-@pytest.mark.parametrize(("slope", "cause"), [(0.87, "the sign of depth_m"), (-0.44, "in metres"), (0.02, ""), (0.0, "")])
+@pytest.mark.parametrize(
+    ("slope", "cause"),
+    [(0.87, "the sign of depth_m"), (0.3, "in metres"), (-0.44, "check that depth_m is in metres"), (0.02, ""), (0.0, "")],
+)
 def test_motions_that_follow_the_depth_are_doubted(slope: float, cause: str) -> None:
     rng = np.random.default_rng(4)
     rise = 0.1 * np.sin(np.arange(40) / 3)
@@ -508,6 +521,11 @@ def test_a_gyroscope_without_the_roll_of_the_vehicle_counts_little() -> None:
     (measured,) = widened.motions(time_s)
     turn = math.tan(math.radians(25)) * math.radians(4) * 0.2
     np.testing.assert_allclose(np.sqrt(measured.covariances[:, 2, 2]), turn, rtol=1e-3)
+    # of every third frame, a motion takes three times as long
+    with pytest.warns(MitsonarWarning, match=r"by some 1\.1 deg in a motion"):
+        _, seldom = source.with_sensors(sensors, 3)
+    (measured,) = seldom.motions(time_s[::3])
+    np.testing.assert_allclose(np.sqrt(measured.covariances[:, 2, 2]), 3 * turn, rtol=1e-3)
     _, level = replace(source, pitch_rad=0.0).with_sensors(sensors)
     np.testing.assert_array_equal(level.yaw_rate.std, sensors.yaw_rate.std)  # type: ignore[union-attr]
 

@@ -82,6 +82,17 @@ def test_a_body_casts_its_shadow_where_it_is_then() -> None:
         np.testing.assert_allclose(np.sort(seen.delay_s), delay[delay > 2 * 9.5 / 1500], atol=1e-9)
 
 
+def test_heights_are_those_above_still_shapes() -> None:
+    """The fish lies below the sonar in its own axes, where nothing is."""
+    away = Trajectory(np.array([[5, 0, 6, 0, 0, 0]], dtype=float), np.zeros(1))
+    whole, floor_only = (
+        ChannelSimulator(scene, SONAR, moving=moving).responses(Trajectory(np.array([LEVEL]), np.zeros(1))).height_m
+        for scene, moving in ((unmerged(fish=box((0, 0, 1), (1, 1, 0.5)), floor=floor(half=8)), {"fish": away}),
+                              (unmerged(floor=floor(half=8)), None))
+    )  # fmt: skip
+    np.testing.assert_array_equal(whole, floor_only)
+
+
 def test_pings_place_bodies_at_their_times() -> None:
     scene = unmerged(fish=fish(), floor=floor(half=4))
     result = ChannelSimulator(scene, SONAR, moving={"fish": SWIMS})

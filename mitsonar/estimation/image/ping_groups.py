@@ -72,9 +72,10 @@ def along_path(frames: SonarFrames, poses: Array, height_m: Array) -> SonarFrame
     """
     if not _in_groups(frames):
         return frames
-    rate = motions(poses) / np.maximum(_intervals_s(frames), 1e-9)[:, None]  # from frame to frame, per second
+    interval_s = _intervals_s(frames)
+    rate = motions(poses) / np.where(interval_s > 0, interval_s, np.inf)[:, None]  # from frame to frame, per second
     before, after = np.concatenate([rate[:1], rate]), np.concatenate([rate, rate[-1:]])
-    known = replace(frames, height_m=height_m, attitude_rad=poses[:, 3:])
+    known = replace(frames, height_m=height_m, poses=poses)
     return replace(frames, image=_all_moved(known, (before + after) / 2))
 
 
@@ -94,9 +95,7 @@ def _all_moved(frames: SonarFrames, rate: Array) -> NDArray[np.float32]:
     offset_s = ping_offsets_s(frames.sonar)[group_of_beams(frames.sonar)]  # from the middle of a frame to each beam's ping
     images = np.asarray(frames.image, dtype=np.float32) / (255 if frames.image.dtype == np.uint8 else 1)
     heights = np.full(len(frames), np.nan) if frames.height_m is None else frames.height_m
-    attitude = frames.attitude_rad
-    if attitude is None and frames.poses is not None:
-        attitude = frames.poses[:, 3:]
+    attitude = frames.attitude_rad if frames.poses is None else frames.poses[:, 3:]
     pitches = np.zeros(len(frames)) if attitude is None else np.nan_to_num(attitude[:, 0])
     cone = frames.sonar.bearing == "cone"
     moved = [

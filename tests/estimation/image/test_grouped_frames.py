@@ -9,7 +9,7 @@ import pytest
 from helpers import Array, essence
 from scipy import ndimage
 
-from mitsonar.estimation.image.ping_groups import at_one_moment, estimate_pair
+from mitsonar.estimation.image.ping_groups import along_path, at_one_moment, estimate_pair
 from mitsonar.estimation.named import create_estimator
 from mitsonar.instruments.sonar import Sonar, group_of_beams, ping_interval_s
 from mitsonar.mapping.mosaic import MosaicOptions, build_mosaic
@@ -123,6 +123,26 @@ def test_without_motion_nothing_moves(bearing: str) -> None:
     moved = at_one_moment(replace(pair, height_m=np.full(2, HEIGHT)), MOTIONS["all"])
     water = sonar.range_m < HEIGHT
     np.testing.assert_allclose(moved.image[:, water], image[:, water], atol=1e-6)
+
+
+def test_the_ground_lies_by_the_pitch_of_the_mount_without_an_attitude() -> None:
+    """Frames with a depth sensor have poses of that pitch, and attitudes of nan."""
+    pair = replace(pair_of(MOTIONS["all"], grouped=True), height_m=None)
+    marked = replace(pair, attitude_rad=np.full((2, 3), np.nan))
+    one, other = (at_one_moment(each, MOTIONS["all"]).image for each in (pair, marked))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_frames_of_equal_times_stay_where_they_are() -> None:
+    """A frame that is repeated with its time has no speed, and does not scatter its beams."""
+    pair = pair_of(MOTIONS["all"], grouped=True)
+    image = pair.image[[0, 0, 1, 1]]
+    poses = np.array(
+        [Pose(0, 0, HEIGHT, 0.5), Pose(1e-4, 0, HEIGHT, 0.5), *[compose(Pose(0, 0, HEIGHT, 0.5), MOTIONS["all"])] * 2]
+    )
+    frames = replace(pair, image=image, time_s=np.array([0.0, 0.0, 0.1, 0.2]), poses=poses, height_m=np.full(4, HEIGHT))
+    moved = along_path(frames, poses, np.full(4, HEIGHT))
+    np.testing.assert_allclose(moved.image[0], image[0], atol=1e-3)
 
 
 def test_frames_far_apart_in_time_are_estimated_once() -> None:
