@@ -37,8 +37,8 @@ class ChannelSensor(mi.Sensor):
     ``transmitter_shape`` [all] and so on.
 
     By default the receivers front, left, back and right lie 0.1 m from the transmitter and point outwards. Others require a
-    heading and a position. As a camera the sensor sends one ray, forward; ``mitsonar impulse`` computes responses. The
-    vehicle shadows the receivers only where a shape follows its path. Multiple bounces require mirrors (``--mirrors``).
+    heading and a position. As a camera the sensor sends one ray, forward; ``mitsonar impulse`` computes responses. Shadowing
+    of the receivers by the vehicle is not modelled. Multiple bounces require mirrors (``--mirrors``).
 
     .. code-block:: xml
 
