@@ -44,7 +44,7 @@ class AcousticMaterial(mi.BSDF):
     ``thesis`` uses the mu of the law, or sigma at normal incidence, for all angles. Impulse responses, other sensors and
     shapes of a ``shapegroup`` use mu, or sigma / sin^2 at 45 deg grazing.
 
-    Not modelled: the echo of the mirror part, transmission, two materials on one shape.
+    Not modelled: transmission, two materials on one shape; the mirror part echoes only where the simulator is given mirrors.
 
     .. code-block:: xml
 

@@ -106,8 +106,8 @@ def odometry(
         bool,
         typer.Option(
             "--map",
-            help="Register frames to a map of the last metres instead of the last frame: over rocks without noise, drift "
-            "falls to a seventh or less.",
+            help="Register frames to a map of the last metres instead of the last frame: less drift over rocks, but with "
+            "speckle often more.",
         ),
     ] = False,
     loops: Annotated[bool, typer.Option("--loops", help="Detect revisited places and close the path there.")] = False,

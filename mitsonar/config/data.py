@@ -469,7 +469,7 @@ class Recipe(RecipePart):
             raise MitsonarError("all receivers must have the same window: range_min, range_max and range_bins")
         if self.labels and self.store == "vectors":
             raise MitsonarError("labels are pixels: store images or both with them")
-        if any(view.sonar.ping_groups > 1 for view in self.views):
+        if self.recorded is None and any(view.sonar.ping_groups > 1 for view in self.views):
             raise MitsonarError("a ping of a data set has one pose: leave out ping_groups, or set it to 1")
         if self.noise_db and (self.instrument.model != "coherent" or self.instrument.noise_level_db is None):
             raise MitsonarError(

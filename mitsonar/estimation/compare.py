@@ -33,6 +33,7 @@ from mitsonar.errors import MitsonarError, argument, count_noun, did_you_mean
 from mitsonar.estimation.crlb.image import bounds_at, overall
 from mitsonar.estimation.estimator import AnyEstimator, PlainTable, Record
 from mitsonar.estimation.external import OwnEstimator
+from mitsonar.estimation.image.ping_groups import estimate_pair
 from mitsonar.estimation.named import EstimatorLike, create_estimator
 from mitsonar.io.files import read_json, read_npz, write_atomic, write_json
 from mitsonar.io.runs import RunDirectory, RunKind, digest, versions
@@ -119,7 +120,7 @@ class Answers:
     def ask(self, index: int, estimator: AnyEstimator, frames: Record) -> None:
         """Estimate one pair and store the result at an index."""
         begun = time.process_time()
-        estimate = estimator.estimate(frames)
+        estimate = estimate_pair(estimator, frames)
         self.ms[index] = 1e3 * (time.process_time() - begun)
         self.motion[index], self.valid[index] = estimate.motion, estimate.valid
         if estimate.covariance is not None:

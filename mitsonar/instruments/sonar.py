@@ -565,7 +565,7 @@ class Sonar(Instrument):
         description="part of the near glow's power that is the same in every ping, as the housing's ringing is",
     )
     absorption_db_per_m: float | None = Field(
-        None, ge=0, le=1e3, description="one way [dB/m]; default: coherent by frequency and water, else 0"
+        None, ge=0, le=1e3, description="one way [dB/m]; default: by frequency and water with a pattern, else 0"
     )
     temperature_c: float = Field(10.0, ge=-2, le=40, description="of the water [deg C]")
     salinity_psu: float = Field(35.0, ge=0, le=45, description="of the water [parts per thousand]")

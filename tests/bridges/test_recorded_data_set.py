@@ -98,6 +98,12 @@ def test_the_recipe_says_where_frames_come_from(places: dict[str, Path], tmp_pat
     assert recipe_from(recipe.model_dump(mode="json")) == recipe
 
 
+def test_frames_of_ping_groups_keep_their_groups(frames: SonarFrames, tmp_path: Path) -> None:
+    replace(frames, sonar=frames.sonar.replace(ping_groups=8)).save(tmp_path / "groups.npz")
+    written(tmp_path / "data.zarr", tmp_path / "groups.npz")
+    assert load_frames(tmp_path / "data.zarr").sonar.ping_groups == 8
+
+
 def test_recipes_of_rendered_frames_keep_their_digest() -> None:
     """What stores and checkpoints keep of a recipe has no key more than before."""
     recipe = load_recipe("rocky-field")
