@@ -495,8 +495,8 @@ class GroundProblem:
         """
         means = [self.means(one.values, one.gain_db)[0][self.view_of] for one in solutions]
         shown, used = self.mean_of_frame, self.valid_of_frame
-        for one in solutions:
-            used = used & self.within_pattern(one.values)[self.view_of]
+        for solution in solutions:
+            used = used & self.within_pattern(solution.values)[self.view_of]
         if not used.any():
             return [(math.nan, math.nan)] * len(solutions)
         inside = np.ones(used.shape, dtype=bool)
