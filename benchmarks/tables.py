@@ -32,7 +32,7 @@ and their speed drifts: compare times within a table only.
 SECTIONS = (
     *("rendering", "several-reflections", "coherent-ping", "live", "realism", "blind-sorting", "recordings", "data-sets"),
     *("odometry", "hulls", "certainty", "any-start", "loops", "long-run", "odometry-benchmark", "dives", "registration"),
-    *("gradients", "height-maps", "trajectories", "limit", "six-degrees", "exactness", "speckle", "networks"),
+    *("gradients", "calibration", "height-maps", "trajectories", "limit", "six-degrees", "exactness", "speckle", "networks"),
     *("unseen-scenes", "table-31", "impulse-responses", "synthetic-aperture", "vectors", "gpu"),
     "house",
 )

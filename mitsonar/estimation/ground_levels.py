@@ -370,6 +370,8 @@ class GroundProblem:
         """Return a solution with outliers left out, and the looks that the spread and correlation of blocks give."""
         mean, _ = self.means(solution.values, solution.gain_db)
         judged = self.valid & self.within_pattern(solution.values)
+        if not judged.any():  # a start whose pattern misses all levels
+            return replace(solution, used=judged, looks=1.0)
         error = np.log(np.where(judged, self.mean, 1.0) / mean)
         middle = float(np.median(error[judged]))
         spread = 1.4826 * float(np.median(np.abs(error[judged] - middle)))
