@@ -113,6 +113,7 @@ OTHER_OPENS = ("tarfile.open(", "file.open(f'{name}.npy'", "reader.open()")
 """Calls named ``open`` of libraries that give bytes or records."""
 
 
+@pytest.mark.thorough
 def test_no_module_but_one_calls_what_only_unix_has() -> None:
     texts = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in SOURCES}
     assert len(texts) > 150
@@ -164,6 +165,7 @@ def test_text_in_the_encoding_of_the_machine_is_found(source: str, found: bool) 
     assert bool(list(text_without_encoding(source))) is found
 
 
+@pytest.mark.thorough
 def test_names_of_files_are_valid_on_every_system() -> None:
     """No two names differ in case only, none is a device of Windows, and none holds a character that it reserves."""
     skipped = {".git", ".venv", "build", "out", "dist", "__pycache__"}

@@ -33,6 +33,7 @@ def test_a_path_over_its_budget_is_noticed() -> None:
     assert trace_house.exceeds_budget("XML to frames", within | {"0.py": lines})
 
 
+@pytest.mark.thorough
 def test_words_that_are_avoided_stay_in_their_places() -> None:
     outside = [use for use in glossary.uses_in(ROOT) if not glossary.allowed(use)]
     assert not outside, outside[:20]

@@ -61,6 +61,7 @@ TANK = """<scene version="3.0.0">
 </scene>"""
 
 
+@pytest.mark.thorough
 def test_a_body_is_where_its_path_says(mitsonar: Command, tmp_path: Path) -> None:
     """A float that rests 3.5 m abeam of the middle of the track; the same run is not resumed with another path."""
     (tmp_path / "tank.xml").write_text(TANK)
@@ -82,6 +83,7 @@ def test_a_body_is_where_its_path_says(mitsonar: Command, tmp_path: Path) -> Non
     refused(mitsonar("sas", tmp_path / "tank.xml", *ENDS, *SMALL, "--moving", f"boat={tmp_path / 'here.tum'}"), "boat")
 
 
+@pytest.mark.thorough
 def test_another_navigation_is_corrected(mitsonar: Command, tmp_path: Path) -> None:
     """Flown with a sway of 1 mm; the navigation knows a straight line."""
     straight = Trajectory.between(Pose(0, -1.2, 2.5), Pose(0, 1.2, 2.5), 97, 20.0)
@@ -105,6 +107,7 @@ def test_another_navigation_is_corrected(mitsonar: Command, tmp_path: Path) -> N
     assert again.returncode == 0, again.stderr
 
 
+@pytest.mark.thorough
 def test_pairs_of_pings_without_coherence_are_named(mitsonar: Command, tmp_path: Path) -> None:
     """One fix of the navigation is 0.5 m off to the side, beyond the delays that are compared."""
     straight = Trajectory.between(Pose(0, -1.2, 2.5), Pose(0, 1.2, 2.5), 49, 10.0)

@@ -114,6 +114,7 @@ def test_a_map_along_another_path_with_another_heading(mitsonar: Command, echogr
     assert ties[0] - ties[1] == pytest.approx(100, abs=0.2)
 
 
+@pytest.mark.thorough
 def test_a_declination_is_taken_into_account_by_the_note_on_headings(mitsonar: Command, tmp_path: Path) -> None:
     written = drawn(line(100, heading=0.3), rng=np.random.default_rng(0), origin=ORIGIN)
     written.poses[:, 5] += 0.3  # headings of a compass

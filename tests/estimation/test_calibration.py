@@ -158,6 +158,7 @@ def test_errors_have_the_size_of_their_standard_deviations() -> None:
     assert 0.4 < np.mean(squares) < 2.0
 
 
+@pytest.mark.thorough
 def test_gains_of_beams_come_back() -> None:
     gain_db = np.random.default_rng(3).normal(0, 1.0, SHEET.beams)
     result = calibrate_sonar(drawn(PLACES, 1, 5, gain_db), beam_gains=True)
@@ -175,6 +176,7 @@ def test_given_values_stay() -> None:
     assert result.notes == []
 
 
+@pytest.mark.thorough
 def test_absorption_that_the_gain_undoes_is_not_written() -> None:
     """The simulator's gain undoes the sonar's absorption, so it cannot hold another."""
     result = calibrate_sonar(drawn(PLACES, 1, 7), gain_exponent=2, gain_absorption=True)

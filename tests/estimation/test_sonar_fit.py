@@ -205,6 +205,7 @@ def test_beams_of_different_pings_are_noted() -> None:
     assert any("beams correlates by 0.0" in note and "ping_groups" in note for note in fit.notes)
 
 
+@pytest.mark.thorough
 def test_unstated_ping_groups(recordings: dict[str, SonarFrames]) -> None:
     frames = recordings["unstated groups"].select(slice(None))
     grouped = frames.sonar

@@ -109,6 +109,7 @@ def test_the_standard_deviation_is_larger_in_shadow() -> None:
     assert np.nanmean(result.std_m[hidden]) > 1.3 * np.nanmean(result.std_m[beside])
 
 
+@pytest.mark.thorough
 def test_speckle_of_the_simulator_leaves_a_box_in_place(variant: str) -> None:
     import mitsuba as mi
 

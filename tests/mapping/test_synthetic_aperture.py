@@ -135,6 +135,7 @@ def test_interpolation_between_taps_is_band_limited() -> None:
 # ---------------------------------------------------------------- speckle of the simulator
 
 
+@pytest.mark.thorough
 def test_even_ground_is_speckle_of_contrast_one_at_the_level_of_its_cells() -> None:
     """Mean C sin^2(grazing) times the cell, 1.5 D / 2 and 1.5 c / 2B over cos(grazing) (Hann); deviation over mean 1.
 

@@ -163,6 +163,7 @@ def test_one_thread_or_two(world: mi.Scene, name: str) -> None:
     assert_same_pings(*result)
 
 
+@pytest.mark.thorough
 def test_threads_may_change_between_launches() -> None:
     """A launch recorded on one thread is replayed on two; in its own interpreter, lest it overruns memory."""
     run_python("""

@@ -210,6 +210,7 @@ def test_information_of_fans_adds_up() -> None:
     np.testing.assert_allclose(stack["ahead", "image", "gaussian"].information, total)  # type: ignore[union-attr]
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("variant")
 def test_speckle_has_bounds_of_six_degrees() -> None:
     sonar = Sonar.create(model="coherent", frequency_hz=1.8e6, beams=12, azimuth_fov_deg=3.6, beam_width_deg=0.3,
