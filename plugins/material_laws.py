@@ -23,8 +23,8 @@ ENTRIES = 91
 """Number of pairs per material: 90 of a value and its change to the next degree, and one with the power of the sine."""
 
 
-RELATIVE_STEP, LEAST_STEP = 1e-4, 1e-6
-"""Steps of the differences that give the derivatives of laws by their constants, in float64: relative, and at least."""
+RELATIVE_STEP, STEP_AT_ZERO = 1e-4, 1e-6
+"""Steps of the differences that give the derivatives of laws by their constants, in float64: relative, and at 0."""
 
 
 def law_rows(materials: Sequence[AcousticMaterial], sonar: Sonar) -> mi.Float:
@@ -65,7 +65,7 @@ def _change(bsdf: AcousticMaterial, name: str, constant: mi.Float, sonar: Sonar)
     given = np.atleast_1d(np.asarray(getattr(bsdf.material, name), dtype=np.float64))
     change = dr.zeros(mi.Float, 2 * ENTRIES)
     for index, number in enumerate(given):
-        step = max(abs(number) * RELATIVE_STEP, LEAST_STEP)
+        step = abs(number) * RELATIVE_STEP or STEP_AT_ZERO
         above, below = (_row(_changed(bsdf.material, name, index, number + by), bsdf.mu, sonar) for by in (step, -step))
         value = dr.gather(mi.Float, constant, mi.UInt32(index))
         change += mi.Float(((above - below) / (2 * step)).tolist()) * (value - dr.detach(value))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
+from scipy import ndimage, stats
 
 __all__ = [
     "RAYLEIGH_DB",
@@ -65,10 +65,10 @@ frame, those with the largest excess; standard errors that a leak must exceed.
 LEAK_CONTRAST = 1000.0
 """Smallest ratio of a row's brightest cell to its quiet beams; below 30 dB, a leak of -50 dB is not visible."""
 
-TEETH_WINDOW, TEETH_LAG, MOST_GROUPS = (15, 9), 48, 16
+GROUP_WINDOW, GROUP_LAG, MOST_GROUPS = (15, 9), 48, 16
 """Parameters of the search for ping groups: window of the local mean, greatest distance [beams], most groups."""
 
-TEETH_SURE, LEAST_TOOTH = 4.5, 0.005
+GROUP_SURE, GROUP_RISE = 4.5, 0.005
 """How far the correlation at the distances of a group must rise: standard errors, and the mean rise.
 
 Groups of six frames of an HAUV's DIDSON and of two recordings of an ARIS 3000 reach 3.5 to 10.5 and 0.007 to 0.019. Without
@@ -218,11 +218,11 @@ def ping_groups(level_db: ArrayLike) -> int:
     """
     level = np.asarray(level_db, dtype=float)
     beams = level.shape[-1]
-    most = min(beams // 2, TEETH_LAG)
+    most = min(beams // 2, GROUP_LAG)
     if most < 4:
         return 1
     # 1. correlation of the grain of each two beams, by their distance; beams count equally
-    grain = detrended(level, TEETH_WINDOW)
+    grain = detrended(level, GROUP_WINDOW)
     grain -= grain.mean(axis=(0, 1))
     spread = grain.std(axis=(0, 1))
     grain /= np.where(spread > 0, spread, 1.0)
@@ -238,17 +238,13 @@ def ping_groups(level_db: ArrayLike) -> int:
             comb = _over_neighbours((np.arange(most + 2) % groups == 0).astype(float))[1:]
             rest = rise - comb * (rise @ comb) / (comb @ comb)
             best, best_rise = groups, mean * root
-            sure = mean > LEAST_TOOTH and mean * root > TEETH_SURE * min(_scatter(rise), _scatter(rest))
+            scatter = min(stats.median_abs_deviation(one, scale="normal") for one in (rise, rest))
+            sure = mean > GROUP_RISE and mean * root > GROUP_SURE * scatter
     return best if sure else 1
 
 
 def _over_neighbours(values: Array) -> Array:
     return np.asarray(values[1:-1] - (values[:-2] + values[2:]) / 2, dtype=np.float64)
-
-
-def _scatter(values: Array) -> float:
-    """Return the standard deviation of normal values, by the median of their distances from the middle one."""
-    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
 def beam_stripes_db(level_db: ArrayLike, window: int = 9) -> float:

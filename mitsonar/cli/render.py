@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mitsonar.instruments.hydrophones import ChannelSonar
+    from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.simulation.runs import Destination, RenderOptions
@@ -90,10 +91,9 @@ def render(
     from mitsonar.acoustics.noise import load_noise, refuse_noise
     from mitsonar.acoustics.water import absorption_line
     from mitsonar.instruments.sonar import Sonar
-    from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.trajectory import convention_named
     from mitsonar.simulation.runs import Destination, RenderOptions, run
-    from mitsonar.simulation.scene import channel_sonar_in, digests_of, find_scene, read_motion_specs, sonar_in
+    from mitsonar.simulation.scene import channel_sonar_in, find_scene, sonar_in
     from mitsonar.simulation.simulator import Simulator
 
     if label_floor and not labels:
@@ -121,14 +121,12 @@ def render(
         raise MitsonarError(
             f"--mirrors needs the model coherent, or --set bounces=2: got {instrument.model}; leave it out, or give one"
         )
-    motions = _motions(loaded, moving, named)
-    bodies = MovingBodies.of(read_motion_specs(motions), named, path)
+    bodies, moved = moving_bodies(loaded, moving, named, path)
     simulator = Simulator(
         loaded, instrument, mirrors="materials" if mirrors else None, moving=bodies, rays_per_launch=rays_per_launch
     )
     _check_above_ground(loaded, path, simulator.motion is not None, simulator)
-    origin |= {"mirrors": True} if mirrors else {}
-    origin |= {"moving": digests_of(motions)} if motions else {}
+    origin |= ({"mirrors": True} if mirrors else {}) | moved
     origin["path"] = {"frames": frames, "from": start, "to": end, "trajectory": trajectory and str(trajectory)}
     origin["path"] |= {} if speed is None else {"speed": speed}
     with progress_bar("rendering", len(path), "pings") as progress:
@@ -195,6 +193,15 @@ def _motions(scene: Any, moving: list[str] | None, frame: str, also: Sequence[Mo
         named = {one.name for one in given}
         given += [one for one in weaker if one.name not in named]
     return given
+
+
+def moving_bodies(scene: Any, moving: list[str] | None, frame: str, path: Trajectory) -> tuple[MovingBodies, dict[str, Any]]:
+    """Return the bodies that move along a vehicle's path, and their digests for the settings of a run, if there are any."""
+    from mitsonar.motion.bodies import MovingBodies
+    from mitsonar.simulation.scene import digests_of, read_motion_specs
+
+    motions = _motions(scene, moving, frame)
+    return MovingBodies.of(read_motion_specs(motions), frame, path), {"moving": digests_of(motions)} if motions else {}
 
 
 # ---------------- ``mitsonar render --all-sensors`` and ``--vehicle``: all sensors of a vehicle in one run
@@ -298,25 +305,23 @@ def impulse(
     resume: options.Resume = False,
 ) -> None:
     """Simulate channels, and write responses.npz, responses.zarr, response.png and waterfall.png into the folder OUT."""
-    from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.trajectory import convention_named
     from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.instrument_runs import iteration_error, run_impulse
     from mitsonar.simulation.runs import Destination
-    from mitsonar.simulation.scene import channel_sonar_in, digests_of, find_scene, read_motion_specs
+    from mitsonar.simulation.scene import channel_sonar_in, find_scene
 
     loaded, origin = _load(scene, parameter)
     sonar, attitude = _channel_sonar(channel_sonar_in(loaded), model, seed, set_ or [])
     named = convention_named(frame).name
-    motions = _motions(loaded, moving, named)
     flown, speeds = _channel_path(sonar, attitude, velocity, frames, start, trajectory, frame)
-    if velocity is None and trajectory is None and len(flown) > 1 and not motions:
+    bodies, moved = moving_bodies(loaded, moving, named, flown)
+    if velocity is None and trajectory is None and len(flown) > 1 and not moved:
         warn("the vehicle does not move, so that all pings are equal: give --velocity vx,vy in m/s, or --trajectory")
     folder = out or Path("out") / f"{find_scene(scene).stem}-impulse"
     parts = _mirrors(mirrors, mirror or [])
     origin |= {"mirrors": True if parts == "materials" else parts} if parts else {}
-    bodies = MovingBodies.of(read_motion_specs(motions), named, flown)
-    origin |= {"moving": digests_of(motions)} if motions else {}
+    origin |= moved
     simulator = ChannelSimulator(loaded, sonar, mirrors=parts, moving=bodies)
     with progress_bar("measuring", len(flown), "pings") as progress:
         destination = Destination(folder, origin, overwrite, resume, progress, configuration_of(ctx))
@@ -476,12 +481,10 @@ def sound(
 ) -> None:
     """Simulate a side-scan, altimeter, profiler, DVL or 3-D sonar on a vehicle, and write its records into OUT."""
     from mitsonar.instruments.sounder import load_sounder
-    from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import convention_named
     from mitsonar.simulation.instrument_runs import run_sounder
     from mitsonar.simulation.runs import Destination
-    from mitsonar.simulation.scene import digests_of, read_motion_specs
     from mitsonar.simulation.sounding import SounderSimulator
 
     named = convention_named(frame).name
@@ -492,11 +495,10 @@ def sound(
     flown = options.path_for(sounder.fan, None, scene, frames, start, end, trajectory, frame, speed)
     flown = options.under_vehicle(flown, sounder, trajectory)
     options.warn_of_speed(flown, end, speed)
-    motions = _motions(loaded, moving, named)
-    bodies = MovingBodies.of(read_motion_specs(motions), named, flown)
+    bodies, moved = moving_bodies(loaded, moving, named, flown)
     simulator = SounderSimulator(loaded, sounder, moving=bodies, rays_per_launch=rays_per_launch)
-    _check_above_ground(loaded, flown, bool(motions))
-    origin |= {"moving": digests_of(motions)} if motions else {}
+    _check_above_ground(loaded, flown, bool(moved))
+    origin |= moved
     folder = out or Path("out") / sounder.name
     with progress_bar("sounding", len(flown), "pings") as progress:
         destination = Destination(folder, origin, overwrite, resume, progress, configuration_of(ctx))

@@ -10,7 +10,7 @@ import typer
 
 from mitsonar.cli import options
 from mitsonar.cli.console import LaterBar, answered, numbers, progress_bar, say, warn
-from mitsonar.cli.render import _load, _motions
+from mitsonar.cli.render import _load, moving_bodies
 from mitsonar.errors import MitsonarError, count_noun
 
 if TYPE_CHECKING:
@@ -81,12 +81,11 @@ def sas(
     from mitsonar.mapping.aperture_run import ApertureOptions, run_aperture
     from mitsonar.mapping.micronavigation import LEAST_COHERENCE
     from mitsonar.mapping.synthetic_aperture import along_resolution, refuse_aliased, strip_grid
-    from mitsonar.motion.bodies import MovingBodies
     from mitsonar.motion.trajectory import Trajectory, convention_named, velocities
     from mitsonar.simulation.channel import ChannelSimulator
     from mitsonar.simulation.instrument_runs import run_impulse
     from mitsonar.simulation.runs import Destination, path_digest
-    from mitsonar.simulation.scene import digests_of, find_scene, read_motion_specs
+    from mitsonar.simulation.scene import find_scene
 
     # 1. instrument and path
     loaded, origin = _load(scene, parameter)
@@ -100,10 +99,8 @@ def sas(
     flown = _path(spacing, trajectory, start, end, speed, frames, frame)
     _refuse_haste(sonar, flown)
     # 2. what is focused is checked before anything is simulated
-    named = convention_named(frame).name
-    motions = _motions(loaded, moving, named)
-    origin |= {"moving": digests_of(motions)} if motions else {}
-    bodies = MovingBodies.of(read_motion_specs(motions), named, flown)
+    bodies, moved = moving_bodies(loaded, moving, convention_named(frame).name, flown)
+    origin |= moved
     seen = sonar.box_seen_from(flown.poses[:: max(1, len(flown) // 1000)])
     simulator = ChannelSimulator(loaded, sonar, within=seen, moving=bodies)
     planned = _planned(simulator, flown)

@@ -232,6 +232,27 @@ def test_levels_of_images_follow_the_constants_of_a_law(name: str) -> None:
     np.testing.assert_allclose(result, expected, rtol=0.01, atol=2e-3 * np.abs(expected).max())
 
 
+def test_small_constants_have_derivatives(tmp_path: Path) -> None:
+    """The step is relative: a strength of 2e-7 m^0.75 is far below the usual ones, and stays above 0."""
+    from mitsonar.plugins.material_laws import law_rows, material_of
+
+    mud = material("mud").model_dump(exclude_none=True, exclude={"source", "about"})
+    (tmp_path / "smooth.yaml").write_text(yaml.safe_dump({**mud, "spectral_strength": 2e-7}))
+    loaded = scene(f=floor(made_of(tmp_path / "smooth.yaml")))
+    bsdf, params = material_of(loaded.shapes()[0]), mi.traverse(loaded)
+    assert bsdf is not None
+    constant = params["f.bsdf.spectral_strength"]
+    dr.enable_grad(constant)
+    laws = law_rows([bsdf], SONAR)
+    dr.forward(constant)
+    above, below = (
+        mu_table(bsdf.material.model_copy(update={"spectral_strength": 2e-7 + step}), SONAR.frequency_hz or 0.0).values
+        for step in (1e-9, -1e-9)
+    )
+    expected = (above - below)[:-1] / 2e-9 / bsdf.mu
+    np.testing.assert_allclose(np.array(dr.grad(laws))[0:180:2], expected, rtol=1e-3)
+
+
 def test_strengths_of_a_tabulated_law_have_derivatives(steep: Path) -> None:
     """One decibel more at every angle is one decibel more of the image; each cell depends on the angles that it sees."""
     loaded = scene(f=floor(made_of(steep)))
