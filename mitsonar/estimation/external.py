@@ -52,6 +52,9 @@ NEIGHBOURS_M, VOXEL_M = (0.3, 0.1), 0.01
 FEWEST_POINTS = 30
 """Smallest number of points of a frame that can be registered."""
 
+DEPENDENT = 1e-12
+"""Smallest eigenvalue of a matrix of correlations above which a covariance counts as positive definite."""
+
 
 @dataclass(frozen=True)
 class CfarGicp:
@@ -369,10 +372,23 @@ class OwnEstimator:
             raise MitsonarError(f"{self.path}: estimate must return an Estimate: got {type(estimate).__name__}") from None
 
     def _covariance(self, values: AnyObject) -> NDArray[np.float64]:
-        """Return a covariance as an array of 3 x 3."""
+        """Return a covariance as an array of 3 x 3, checked for variances above 0 and correlations below 1."""
         covariance = np.asarray(values, dtype=np.float64)
         if covariance.shape != (3, 3):
             raise MitsonarError(f"{self.path}: the covariance of an Estimate must be 3 x 3 or None: got {covariance.shape}")
+        variances = np.diag(covariance)
+        if not (np.isfinite(covariance).all() and (variances > 0).all() and np.allclose(covariance, covariance.T)):
+            got = ", ".join(f"{one:.3g}" for one in variances)
+            raise MitsonarError(
+                f"{self.path}: the covariance of an Estimate must be finite and symmetric, with variances above 0: got "
+                f"variances {got} m^2, m^2, rad^2; give None where it is unknown"
+            )
+        scale = np.sqrt(variances)
+        if np.linalg.eigvalsh(covariance / np.outer(scale, scale))[0] < DEPENDENT:
+            raise MitsonarError(
+                f"{self.path}: the covariance of an Estimate must be positive definite: its components depend on each other; "
+                "add the variance of each component's own noise, or give None"
+            )
         return covariance
 
 

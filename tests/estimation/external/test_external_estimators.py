@@ -186,6 +186,28 @@ def test_a_class_of_the_users_own_is_an_estimator(ground: NDArray[np.float64]) -
         create_estimator("my_module:Bare").estimate(frames)
 
 
+@pytest.mark.parametrize(
+    ("covariance", "reason"),
+    [
+        (np.eye(2), r"must be 3 x 3 or None: got \(2, 2\)"),
+        (np.zeros((3, 3)), "variances above 0: got variances 0, 0, 0 m"),
+        (np.diag([1e-6, -1e-6, 1e-8]), "variances above 0: got variances 1e-06, -1e-06, 1e-08"),
+        (np.diag([1e-6, np.nan, 1e-8]), "finite and symmetric"),
+        (np.array([[1.0, 0.5, 0.0], [0.1, 1.0, 0.0], [0.0, 0.0, 1.0]]), "symmetric"),
+        (1e-8 * np.ones((3, 3)), "positive definite: its components depend on each other"),
+    ],
+)
+def test_a_covariance_that_is_none_is_one_sentence(
+    covariance: NDArray[np.float64], reason: str, ground: NDArray[np.float64]
+) -> None:
+    class Odd:
+        def estimate(self, frames: SonarFrames) -> Estimate:
+            return Estimate(Motion(0.0, 0.0, 0.0), covariance)
+
+    with pytest.raises(MitsonarError, match=reason):
+        create_estimator(Odd()).estimate(pair(ground, Motion(0.0, 0.0, 0.0)))
+
+
 @pytest.mark.usefixtures("mine")
 @pytest.mark.parametrize(
     ("text", "reason"),
