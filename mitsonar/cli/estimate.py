@@ -280,8 +280,6 @@ def mosaic(
         source = source.with_geometry(path_height)
     if source.height_m is None and is_recording(frames):
         source = with_assumed_plane(source)
-    if source.height_m is None:
-        raise MitsonarError(f"{source.name} holds no height over the ground: give --height")
     if trajectory == "true":
         if source.true is None:
             raise MitsonarError(
@@ -290,7 +288,9 @@ def mosaic(
         paths = {"true": source.true}
     laid_along = next(iter(paths))
     index, poses = source.along(paths[laid_along])
-    heights = source.height_m[index]
+    heights = source.heights_along(index, poses)
+    if heights is None:
+        raise MitsonarError(f"{source.name} holds no height over the ground: give --height")
     light = None
     if flatten:
         some = np.unique(np.linspace(0, len(index) - 1, min(ILLUMINATION_FRAMES, len(index))).astype(np.intp))

@@ -386,7 +386,7 @@ class OwnEstimator:
         scale = np.sqrt(variances)
         if np.linalg.eigvalsh(covariance / np.outer(scale, scale))[0] < DEPENDENT:
             raise MitsonarError(
-                f"{self.path}: the covariance of an Estimate must be positive definite: its components depend on each other; "
+                f"{self.path}: the covariance of an Estimate must be positive definite: components depend on each other; "
                 "add the variance of each component's own noise, or give None"
             )
         return covariance

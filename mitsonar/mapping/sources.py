@@ -24,7 +24,7 @@ from scipy.spatial.transform import Slerp
 from mitsonar.acoustics.levels import LocalContrast, fitted_contrast
 from mitsonar.acoustics.noise import NoiseModel
 from mitsonar.errors import MitsonarError, MitsonarWarning, argument, count_noun, suggest_names
-from mitsonar.geometry.ground import UNKNOWN_PER_S, USUAL_LEAN_RAD
+from mitsonar.geometry.ground import UNKNOWN_MOST, UNKNOWN_PER_S, USUAL_LEAN_RAD
 from mitsonar.io.files import missing_file
 from mitsonar.io.runs import kind_of_run
 from mitsonar.motion.errors import associated
@@ -239,7 +239,7 @@ class FrameSource:
         return replace(
             self,
             height_m=heights,
-            given_height_m=height_m,
+            given_height_m=self.given_height_m if height_m is None else height_m,
             pitch_rad=pitch_rad if self.pitch_rad is None else self.pitch_rad,
         )
 
@@ -278,7 +278,7 @@ class FrameSource:
         if lean is None:
             return aided, self._with_unknown_roll(sensors, every)
         known = self.attitudes(np.arange(len(self)))
-        if known is None:
+        if known is None or np.isnan(known[:, 3]).all():
             raise MitsonarError(
                 f"{self.name}: {sensors.name} hold the attitude of the vehicle, but the pitch of the sonar on it is not "
                 f"known: give {argument('pitch_rad')}, 0 for a sonar that looks straight ahead"
@@ -295,13 +295,14 @@ class FrameSource:
         gyro = sensors.yaw_rate
         if gyro is None or self.pitch_rad is None or self.poses is not None:
             return sensors
-        turn_s = abs(math.tan(self.pitch_rad)) * UNKNOWN_PER_S.roll_rad  # on a calm day
         step_s = every * float(np.median(np.diff(self.time_s)))
-        noise = turn_s * math.sqrt(step_s)
+        # on a calm day, whose rolls are bounded over long steps
+        turn = abs(math.tan(self.pitch_rad)) * min(UNKNOWN_PER_S.roll_rad * step_s, UNKNOWN_MOST.roll_rad)
+        noise = turn / math.sqrt(step_s)
         if noise > LARGE_NOISE * float(np.median(gyro.std)):
             warnings.warn(
                 f"{self.name}: as the vehicle rolls, a sonar pitched by {math.degrees(self.pitch_rad):.3g} deg turns by "
-                f"some {math.degrees(turn_s * step_s):.2g} deg in a motion, which the gyroscope of {sensors.name} does not "
+                f"some {math.degrees(turn):.2g} deg in a motion, which the gyroscope of {sensors.name} does not "
                 "see: add vehicle_pitch_deg and vehicle_roll_deg, or it hardly counts",
                 MitsonarWarning,
                 stacklevel=4,
@@ -391,11 +392,11 @@ class FrameSource:
         return poses
 
     def chunks(self, index: ArrayLike) -> Iterator[SonarFrames]:
-        """Read the frames with these numbers ``(n,)``, a few at a time."""
+        """Read the frames with these numbers ``(n,)``, a few at a time: a lone frame shows no motion of grouped beams."""
         chosen = np.asarray(index, dtype=np.intp)
-        count = self.frames_per_chunk
-        for start in range(0, len(chosen), count):
-            yield self.read(chosen[start : start + count])
+        for some in np.array_split(chosen, max(1, -(-len(chosen) // max(3, self.frames_per_chunk)))):
+            if len(some):
+                yield self.read(some)
 
     def along(self, path: Trajectory, tolerance_s: float = 0.01) -> tuple[Index, Array]:
         """Return the numbers ``(n,)`` of the frames for which a path has a pose, and these poses ``(n, 6)``.
@@ -420,6 +421,21 @@ class FrameSource:
             poses[:, 3:5] = attitudes[:, 3:5]
         return index, poses
 
+    def heights_along(self, index: Index, poses: Array) -> Array | None:
+        """Return the heights over the ground of the frames ``index`` ``(n,)`` [m] along a path; None if they are not known.
+
+        A height that is given or assumed, the same for all frames, is the mean over a path that heaves.
+
+        Args:
+            index: numbers of the frames ``(n,)``.
+            poses: poses of the path at these frames ``(n, 6)`` [m, rad].
+        """
+        if self.height_m is None:
+            return None
+        heights = self.height_m[index]
+        guess = self.assumed_height or self.given_height_m is not None
+        return heights + poses[:, 2] - poses[:, 2].mean() if guess and len(heights) and np.ptp(heights) == 0 else heights
+
     @property
     def frames_per_chunk(self) -> int:
         """Return the number of frames that are read at a time."""
@@ -430,7 +446,10 @@ class FrameSource:
         digest = hashlib.sha256(self.like.sonar.model_dump_json().encode())
         for values in (self.like.range_m, self.like.bearing_rad, self.time_s, self.poses, self.height_m):
             digest.update(b"-" if values is None else np.ascontiguousarray(values, dtype=float).tobytes())
-        digest.update(b"" if self.attitude_rad is None else np.ascontiguousarray(self.attitude_rad, dtype=float).tobytes())
+        for extra in (self.attitude_rad, self.rise_m, self.attitude_std, self.pattern_db):
+            digest.update(b"" if extra is None else np.ascontiguousarray(extra, dtype=float).tobytes())
+        if (self.like.level, self.like.level_scale) != ("linear", 1.0):
+            digest.update(repr((self.like.level, self.like.level_scale)).encode())
         digest.update(repr((self.pitch_rad, self.noise, self.seed, self.first_number)).encode())
         digest.update(b"" if self.altimeter is None else repr(self.altimeter).encode())
         digest.update(b"" if self.contrast is None else repr(self.contrast).encode())

@@ -22,7 +22,7 @@ from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import Sounder
 from mitsonar.io.files import read_npz, write_atomic
-from mitsonar.io.runs import RunDirectory, RunKind
+from mitsonar.io.runs import RunDirectory, RunKind, digest
 from mitsonar.io.storage import refuse_codecs
 from mitsonar.motion.bodies import MovingBodies
 from mitsonar.motion.sensors import save_sensors
@@ -127,7 +127,7 @@ def run_impulse(
         "sonar": sonar.model_dump(mode="json"),
         "pings": len(flown),
         "poses_sha256": path_digest(flown),
-        "velocity": velocity[0].tolist() if len(np.unique(velocity, axis=0)) == 1 else "of the path",
+        "velocity": _velocity_settings(flown, velocity),
     }
     begun = float(flown.time_s[0])
     paths = [
@@ -151,6 +151,13 @@ def run_impulse(
 
     directory = write_run(CHANNEL_MEASUREMENT, settings, destination, steps, frames_done=0)
     return ImpulseReport(spread, directory.notes.get("warnings") or [])
+
+
+def _velocity_settings(flown: Trajectory, velocity: NDArray[np.float64]) -> list[float] | str:
+    """Return the velocities as a run records them: one for all pings, those of the path, or the digest of others."""
+    if len(np.unique(velocity, axis=0)) == 1:
+        return [float(one) for one in velocity[0]]
+    return "of the path" if np.array_equal(velocity, velocities(flown)) else digest(velocity.tobytes())
 
 
 def _write_responses(

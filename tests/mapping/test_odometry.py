@@ -427,6 +427,42 @@ def test_few_frames_are_in_memory_at_a_time() -> None:
     assert big.frames_per_chunk * SONAR.range_bins * SONAR.beams * 4 <= 8 * 2**20
 
 
+def test_no_frame_is_read_alone() -> None:
+    """The motion of beams that ping in groups needs a second frame."""
+    source = FrameSource.of(numbered(sway(9)))
+    per_chunk = source.frames_per_chunk
+    many = np.arange(2 * per_chunk + 1) % 9
+    sizes = [len(one) for one in source.chunks(many)]
+    assert sum(sizes) == len(many)
+    assert 2 < min(sizes) <= max(sizes) <= per_chunk
+    assert [len(one) for one in source.chunks([4])] == [1]
+    assert list(source.chunks([])) == []
+
+
+def test_a_given_height_is_the_mean_over_a_path_that_heaves() -> None:
+    path = sway(5).poses.copy()
+    path[:, 2] = 7.0 + np.array([0.0, 0.1, 0.2, 0.1, 0.1])
+    source = FrameSource.of(replace(over_ground(sway(5)), poses=None, height_m=None))
+    index = np.array([1, 2, 4])
+    assert source.heights_along(index, path[index]) is None
+    heights = source.with_geometry(2.0).heights_along(index, path[index])
+    np.testing.assert_allclose(heights, 2.0 + np.array([0.1, 0.2, 0.1]) - 0.4 / 3)  # type: ignore[arg-type]
+    measured = replace(source, height_m=np.full(5, 2.0))
+    np.testing.assert_array_equal(measured.heights_along(index, path[index]), 2.0)
+
+
+def test_frames_that_read_otherwise_have_another_digest() -> None:
+    frames = over_ground(sway(4))
+    source = FrameSource.of(frames)
+    others = [
+        replace(source, like=replace(source.like, level="dB")),
+        replace(source, like=replace(source.like, level_scale=2.0)),
+        replace(source, rise_m=np.arange(4.0)),
+        replace(source, pattern_db=np.ones(frames.image.shape[1:], np.float32)),
+    ]
+    assert len({one.digest() for one in [source, *others]}) == 1 + len(others)
+
+
 def test_frames_are_the_same_wherever_they_lie(tmp_path: Path) -> None:
     frames = over_ground(sway(12))
     frames.elevation_rad = np.zeros_like(frames.image)
@@ -511,6 +547,7 @@ def test_geometry_is_given_where_it_lacks_and_only_there() -> None:
         FrameSource.of(frames).with_geometry(-1.0)
     far = float(frames.range_m[-1])
     assert FrameSource.of(frames).with_geometry(far).given_height_m == far
+    assert FrameSource.of(frames).with_geometry(far).with_geometry(pitch_rad=0.5).given_height_m == far
     with pytest.raises(MitsonarError, match="no ground is seen from a height of 3500 m: give heights in metres"):
         FrameSource.of(frames).with_geometry(3500.0)
     with pytest.raises(MitsonarError, match=r"-90..90"):

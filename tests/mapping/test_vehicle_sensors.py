@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -111,6 +112,9 @@ def test_frames_take_height_and_attitude_from_the_sensors_of_a_vehicle() -> None
     source = FrameSource.of(replace(frames, poses=None, height_m=None, attitude_rad=None))
     with pytest.raises(MitsonarError, match="the pitch of the sonar on it is not known"):
         source.with_sensors(sensors)
+    unmeasured = replace(source, attitude_rad=np.full((len(sonar), 3), np.nan))
+    with pytest.raises(MitsonarError, match="the pitch of the sonar on it is not known"):
+        unmeasured.with_sensors(sensors)
     aided, _ = source.with_geometry(float(sonar.poses[:, 2].mean()), np.radians(25)).with_sensors(sensors)
     some = np.arange(len(sonar))
     poses = aided.attitudes(some)
@@ -521,11 +525,12 @@ def test_a_gyroscope_without_the_roll_of_the_vehicle_counts_little() -> None:
     (measured,) = widened.motions(time_s)
     turn = math.tan(math.radians(25)) * math.radians(4) * 0.2
     np.testing.assert_allclose(np.sqrt(measured.covariances[:, 2, 2]), turn, rtol=1e-3)
-    # of every third frame, a motion takes three times as long
-    with pytest.warns(MitsonarWarning, match=r"by some 1\.1 deg in a motion"):
-        _, seldom = source.with_sensors(sensors, 3)
-    (measured,) = seldom.motions(time_s[::3])
-    np.testing.assert_allclose(np.sqrt(measured.covariances[:, 2, 2]), 3 * turn, rtol=1e-3)
+    # of every second frame, a motion takes twice as long; rolls apart by more than half a second differ by 2 deg
+    for every, seen, factor in ((2, "0.75", 2), (5, "0.93", 2.5)):
+        with pytest.warns(MitsonarWarning, match=f"by some {re.escape(seen)} deg in a motion"):
+            _, seldom = source.with_sensors(sensors, every)
+        (measured,) = seldom.motions(time_s[::every])
+        np.testing.assert_allclose(np.sqrt(measured.covariances[:, 2, 2]), factor * turn, rtol=1e-3)
     _, level = replace(source, pitch_rad=0.0).with_sensors(sensors)
     np.testing.assert_array_equal(level.yaw_rate.std, sensors.yaw_rate.std)  # type: ignore[union-attr]
 

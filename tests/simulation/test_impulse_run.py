@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from channel_scenes import LEVEL, cells_floor, simulator
 
+from mitsonar.errors import MitsonarError
 from mitsonar.instruments.hydrophones import ChannelSonar
+from mitsonar.motion.trajectory import Trajectory, velocities
 from mitsonar.simulation.channel import Paths
-from mitsonar.simulation.instrument_runs import spread_of
+from mitsonar.simulation.instrument_runs import run_impulse, spread_of
+from mitsonar.simulation.runs import Destination
 
 
 def paths(delay_s: float, doppler_hz: float, around_hz: float) -> Paths:
@@ -39,3 +44,18 @@ def test_four_receivers_at_one_metre_a_second() -> None:
     assert [one.delay_s for one in alone] == pytest.approx([4.8e-3] * 4, rel=0.03)
     assert [one.doppler_hz for one in alone] == pytest.approx([37.0, 62.0, 37.0, 62.0], rel=0.04)
     assert spread_of(each) == max(alone, key=lambda one: one.factor)
+
+
+@pytest.mark.usefixtures("variant")
+def test_a_run_goes_on_only_with_the_velocities_that_it_began_with(tmp_path: Path) -> None:
+    channel = simulator(ChannelSonar(), floor=cells_floor())
+    poses = np.array([LEVEL] * 3, dtype=float)
+    poses[:, 0] += [0.0, 0.1, 0.3]
+    flown = Trajectory(poses, np.arange(3.0))
+    drift = velocities(flown) + np.linspace(0.0, 0.3, 3)[:, None]
+    for name, velocity in (("path", velocities(flown)), ("drift", drift)):
+        run_impulse(channel, flown, velocity, Destination(tmp_path / name))
+        run_impulse(channel, flown, velocity, Destination(tmp_path / name, resume=True))
+    for name, velocity in (("path", drift), ("drift", 2 * drift)):
+        with pytest.raises(MitsonarError, match="velocity"):
+            run_impulse(channel, flown, velocity, Destination(tmp_path / name, resume=True))

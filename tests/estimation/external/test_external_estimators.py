@@ -194,7 +194,7 @@ def test_a_class_of_the_users_own_is_an_estimator(ground: NDArray[np.float64]) -
         (np.diag([1e-6, -1e-6, 1e-8]), "variances above 0: got variances 1e-06, -1e-06, 1e-08"),
         (np.diag([1e-6, np.nan, 1e-8]), "finite and symmetric"),
         (np.array([[1.0, 0.5, 0.0], [0.1, 1.0, 0.0], [0.0, 0.0, 1.0]]), "symmetric"),
-        (1e-8 * np.ones((3, 3)), "positive definite: its components depend on each other"),
+        (1e-8 * np.ones((3, 3)), "positive definite: components depend on each other"),
     ],
 )
 def test_a_covariance_that_is_none_is_one_sentence(
