@@ -77,7 +77,7 @@ Samples = SonarPairs | ImpulseSamples
 """The samples of a data set on which estimators are compared."""
 
 VARIATIONS: dict[str, str] = {
-    "as told": "height, pitch, roll and sound speed are right",
+    "as given": "height, pitch, roll and sound speed are right",
     "height 5 %": "the given height is 5 % too large or too small (without effect where first echoes give it)",
     "pitch 1 deg": "the given pitch is 1 deg off",
     "roll 1 deg": "the given roll is 1 deg off",
@@ -197,7 +197,7 @@ def answers_of(
     estimators: Mapping[str, AnyEstimator],
     pairs: Samples,
     numbers: Sequence[int],
-    variation: str = "as told",
+    variation: str = "as given",
     *,
     known: dict[str, Answers] | None = None,
     keep: Callable[[dict[str, Answers]], None] | None = None,
@@ -761,8 +761,8 @@ def _settings(bench: Bench, options: ComparisonOptions) -> PlainTable:
 
 
 def _variations(options: ComparisonOptions) -> list[str]:
-    changed = [name for name in VARIATIONS if name not in ("as told", "jitter")] if options.perturb else []
-    return ["as told", *changed, *(["jitter"] if options.jitter else [])]
+    changed = [name for name in VARIATIONS if name not in ("as given", "jitter")] if options.perturb else []
+    return ["as given", *changed, *(["jitter"] if options.jitter else [])]
 
 
 def _key(level: str, model: NoiseModel | None) -> str:

@@ -131,7 +131,7 @@ def evaluate(
     progress, tables = begin(len(levels) * len(subject.numbers)), []
     for level in levels:
         predicted = predictions(checkpoint, samples[level], batch, numbers=subject.numbers, device=device, progress=progress)
-        tables.append({"noise": level, "variation": "as told", **_table(checkpoint, subject, ms, *predicted)})
+        tables.append({"noise": level, "variation": "as given", **_table(checkpoint, subject, ms, *predicted)})
     return _report(checkpoint, data, part, samples[levels[0]], subject, sonar_differences, tables)
 
 

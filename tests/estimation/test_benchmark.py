@@ -107,7 +107,7 @@ def test_all_methods_get_the_same_pairs_and_failures_count(pairs: SonarPairs) ->
 
 
 def test_what_is_told_wrongly_is_what_the_row_says(pairs: SonarPairs) -> None:
-    message = {number: frames for number, frames in frames_of(pairs, [0, 1], "as told")}
+    message = {number: frames for number, frames in frames_of(pairs, [0, 1], "as given")}
     changes: dict[str, Callable[[SonarFrames], np.float64]] = {
         "height 5 %": lambda f: np.asarray(f.height_m)[0],
         "pitch 1 deg": lambda f: np.degrees(np.asarray(f.poses)[0, 3]),
@@ -121,7 +121,7 @@ def test_what_is_told_wrongly_is_what_the_row_says(pairs: SonarPairs) -> None:
             expected = (1 if number % 2 == 0 else -1) * (float(variation.split()[-2]) / (100 if "%" in variation else 1))
             assert size == pytest.approx(expected), variation
             assert (frames.image == message[number].image).all()
-    assert {"heave 5 mm", "jitter", "as told"} < set(VARIATIONS)
+    assert {"heave 5 mm", "jitter", "as given"} < set(VARIATIONS)
 
 
 def test_compare_in_python_is_the_table_of_the_command(
@@ -217,7 +217,7 @@ def test_command_prints_a_table_and_goes_on(mitsonar: Command, made: Path, tmp_p
     words = ("compare", made, "--part", "all", "--noise", "none,high", "--limit", 0, "--estimators", "zero,ecc,direct")
     done = mitsonar(*words, "-o", tmp_path / "out", "--prior")
     assert done.returncode == 0, done.stderr
-    assert "noise none, as told" in done.stdout
+    assert "noise none, as given" in done.stdout
     assert "| zero " in done.stdout
     assert "direct with prior" in done.stdout
     assert "ecc less direct" in done.stdout

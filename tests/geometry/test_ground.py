@@ -1,4 +1,4 @@
-"""The height over the visible surface: by first echoes, as told, and over ground that rises."""
+"""The height over the visible surface: by first echoes, as given, and over ground that rises."""
 
 from __future__ import annotations
 
