@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -408,24 +409,30 @@ def _leaking_rows(intensity: Array) -> _Rows | None:
     return _Rows(excess, lift, level, top, float(1.25 * spread / np.sqrt(LEAK_ROWS)))
 
 
-def leak_power(intensity: ArrayLike, limit: float = np.inf) -> float:
-    """Return the power that leaks into every beam, relative to the summed intensity of all beams.
+def leak_power(intensities: Sequence[ArrayLike], limit: float = np.inf) -> float:
+    """Return the power that leaks into every beam of a ping, relative to the summed intensity of its beams.
 
     In rows with a strong target, the quiet beams are compared with the same beams in rows before and behind. The leak has
     another phase and amplitude in every beam, so it raises their median as it raises their mean. Rows with a cell at or
     above ``limit`` are excluded, since their clipped intensity is unknown.
 
+    Args:
+        intensities: intensities ``(frames, bins, beams)`` of each group of beams that ping together.
+        limit: intensity at which values are clipped.
+
     Returns:
-        The median over the strongest rows; 0 if quiet beams rise by no more than chance.
+        The median over the strongest rows of all groups; 0 if quiet beams rise by no more than chance.
     """
-    intensity = np.asarray(intensity, dtype=float)
-    rows = _leaking_rows(intensity)
-    if rows is None or not (below_limit := rows.top < limit).any():
+    groups = [one for group in intensities if (one := _leaking_rows(np.asarray(group, dtype=float))) is not None]
+    if not groups:
         return 0.0
-    if np.median(rows.lift[below_limit]) < np.log(2) + LEAK_SURE * rows.chance:
+    excess, lift, level, top = (np.concatenate([group[k] for group in groups]) for k in range(4))
+    below_limit = top < limit
+    chance = float(np.mean([group.chance for group in groups])) / math.sqrt(len(groups))
+    if not below_limit.any() or np.median(lift[below_limit]) < np.log(2) + LEAK_SURE * chance:
         return 0.0
-    leaked = np.maximum(0, rows.lift[below_limit] / np.log(2) - 1) * rows.level[below_limit]
-    return float(np.median(leaked / rows.excess[below_limit]))
+    leaked = (lift[below_limit] / np.log(2) - 1) * level[below_limit] / excess[below_limit]
+    return max(0.0, float(np.median(leaked)))
 
 
 def smear_db(level_db: ArrayLike) -> float:

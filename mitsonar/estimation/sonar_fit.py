@@ -224,8 +224,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
     # 4. a rise of quiet beams of the same ping next to a strong echo is crosstalk
     limit, group = float(decoded(FULL_SCALE, sonar)), group_of_beams(sonar)
     parts = [intensity[:, statistics.GLOW_BINS :, group == one] for one in range(sonar.ping_groups)]
-    leaks = [one for part in parts if (one := statistics.leak_power(part, limit)) > 0]  # 0 in groups without strong echoes
-    leak = float(np.mean(leaks)) if leaks else 0.0
+    leak = statistics.leak_power(parts, limit)
     stripes = statistics.stripes_by_group_db(level, group)
     fitted: dict[str, Any] = {
         **{"near_glow_db": 0.0, "near_glow_edge_db": 0.0, "near_glow_spread_db": 0.0, "near_glow_still": 0.0},

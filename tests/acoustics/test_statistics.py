@@ -166,12 +166,26 @@ def test_smear_of_targets(leak_db: float) -> None:
         result[:, bin_ - 3 : bin_ + 4, beam] += 1.0 * peak
     result = result + 10 ** (leak_db / 20) * result @ field((96, 96), 6)
     power = np.abs(result) ** 2
-    assert 10 * np.log10(statistics.leak_power(power)) == pytest.approx(leak_db, abs=1.0)
+    assert 10 * np.log10(statistics.leak_power([power])) == pytest.approx(leak_db, abs=1.0)
     assert statistics.smear_db(decibels(power)) == pytest.approx(80 + leak_db, abs=1.5)
     clean = np.abs(1e-4 * field((4, 400, 96), 5)) ** 2
     assert statistics.smear_db(decibels(clean)) == pytest.approx(0, abs=1.5)
-    assert statistics.leak_power(clean) == 0
-    assert statistics.leak_power(power, limit=1e-9) == 0.0
+    assert statistics.leak_power([clean]) == 0
+    assert statistics.leak_power([power], limit=1e-9) == 0.0
+
+
+def test_one_group_that_rises_by_chance_does_not_set_the_leak() -> None:
+    """Twenty targets over eight groups: a group of one target errs by decibels, and that with the largest error by 20."""
+    random = np.random.default_rng(1)
+    result = 1e-4 * field((4, 400, 96), 5)
+    for _ in range(20):
+        bin_, beam = random.integers(10, 390), random.integers(0, 96)
+        result[:, bin_ - 3 : bin_ + 4, beam] += np.exp(-((np.arange(-3, 4) / 1.2) ** 2))
+    group = np.arange(96) % 8
+    together = group[:, None] == group
+    power = np.abs(result + 1e-3 * result @ (field((96, 96), 6) * together)) ** 2
+    leak_db = 10 * np.log10(statistics.leak_power([power[..., group == one] for one in range(8)]))
+    assert leak_db == pytest.approx(-60, abs=3.5)
 
 
 def test_smoothing_adds_memory_only() -> None:
