@@ -50,6 +50,7 @@ from mitsonar.estimation.image.registration import (
     by_block,
     cauchy,
     cell_blocks,
+    central_differences,
     correlated_cells,
     is_resolved,
     noise_of,
@@ -68,6 +69,7 @@ from mitsonar.records.frames import LABELS, SonarFrames
 __all__ = ["Direct", "is_far", "registered_over_relief"]
 
 
+Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 LEVELS = (
@@ -91,11 +93,11 @@ MODEL = 1.4
 They range from 0.9 to 2.3 in speckle and from 0.7 to 1.8 in static texture.
 """
 
-FAR_MODEL = 2.2
-"""Squared errors over the covariance from the blocks' gradients, where block heights are estimated.
+FAR_MODEL = 1.6
+"""Squared errors over the jackknife's covariance, where block heights are estimated.
 
-Measured on dives over rocky fields with a DIDSON, an ARIS and an Oculus, with and without speckle, 40 and 200 mm apart:
-0.7 to 4.9, with a mean of 2.2.
+Measured 90 and 250 mm apart, over rocky fields with a DIDSON and an Oculus, with and without noise, and over a pattern with
+and without speckle: 0.6 to 3.3, with a mean of 1.7.
 """
 
 MOST_CELLS = 196_608
@@ -376,6 +378,9 @@ RELIEF_LEVELS = (
 RELIEF_BLOCK = (32, 12)
 """Bins and beams that share one height."""
 
+CORRELATED_BLOCKS = (1, 2)
+"""Blocks along bins and beams whose errors are correlated."""
+
 RELIEF_STD = 0.048
 """Standard deviation of a block's height, as a fraction of the sonar's: 0.12 m at 2.5 m."""
 
@@ -384,6 +389,9 @@ ILLUMINATION = (12.0, 4.0)
 
 CORRELATED_RESIDUALS = 20.0
 """Residuals that count as one: those of a block err together where its ground deviates from the model."""
+
+PAIRS = tuple((k, right) for k in range(4) for right in range(k, 4))
+"""Pairs of motion and height whose products are the upper half of a symmetric matrix."""
 
 SETTLED = np.array([3e-4, 3e-4, 6e-5])
 """Steps below which an iteration ends [m, m, rad]: a fifth of the error that remains over relief."""
@@ -399,7 +407,7 @@ class _Equations(NamedTuple):
     """Normal equations of motion and block heights.
 
     Attributes:
-        normal: of the motion ``(3, 3)``.
+        normal: of the motion, from each block ``(3, 3, blocks)``.
         cross: cross terms of motion and heights ``(3, blocks)``.
         height: diagonal term of each block's height ``(blocks,)``.
         gradients: gradient by the motion, from each block ``(3, blocks)``.
@@ -427,10 +435,12 @@ class _Equations(NamedTuple):
             prior: information of each height [1/m^2].
             height_offsets: heights minus their prior mean ``(blocks,)`` [m].
         """
-        height_normal = self.height + self.noise * prior
-        return self.normal - (self.cross / height_normal) @ self.cross.T, self.reduced_gradients(prior, height_offsets).sum(
-            axis=1
-        )
+        normal = self.reduced_normals(prior).sum(axis=-1)
+        return normal, self.reduced_gradients(prior, height_offsets).sum(axis=1)
+
+    def reduced_normals(self, prior: float) -> NDArray[np.float64]:
+        """Return each block's normal matrix of the motion, its height eliminated ``(3, 3, blocks)``."""
+        return self.normal - self.cross[:, None] * self.cross / (self.height + self.noise * prior)
 
     def reduced_gradients(self, prior: float, height_offsets: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return each block's gradient by the motion, its height eliminated ``(3, blocks)``; see :meth:`without_heights`."""
@@ -513,12 +523,11 @@ class _ReliefLevel:
         total = np.sum(list(sums), axis=0)  # motion-motion, motion-residual, height-motion, height-height, height-residual
         by_motion, cross, height = total[:12].reshape(3, 4, -1), total[12:15], total[15:]
         correlation = correlation_of(first.before[first.inside], first.after[first.inside])
-        normal, gradients = by_motion[:, :3].sum(axis=-1), by_motion[:, 3]
         return _Equations(
-            normal,
+            by_motion[:, :3],
             cross,
             height[0],
-            gradients,
+            by_motion[:, 3],
             height[1],
             CORRELATED_RESIDUALS * first.scale**2,
             correlation,
@@ -563,22 +572,48 @@ class _ReliefLevel:
 
     def _block_sums(self, side: _ResampledFrame, residual: Floats) -> NDArray[np.float64]:
         """Return sums over blocks ``(17, blocks)``: motion by motion, motion by residual, height by all."""
-        jacobian, weighted, shown = side.jacobian, side.weighted, side.shown
+        jacobian, weighted = side.jacobian, side.weighted
         pairs = [(weighted[k], right) for k in range(3) for right in jacobian[k:3]]  # the other half is symmetric
         pairs += [(weighted[k], residual) for k in range(3)]
         pairs += [(weighted[3], right) for right in (*jacobian, residual)]
-        if shown is None:
-            sums = products_by_block(pairs, self.block)
-        else:
-            place = [
-                np.clip(where // edge, 0, count - 1).astype(np.intp)
-                for where, edge, count in zip(shown, self.block, self.blocks, strict=True)
-            ]
-            number = (place[0] * self.blocks[1] + place[1]).ravel()
-            count = self.blocks[0] * self.blocks[1]
-            sums = np.stack([np.bincount(number, (a * b).ravel(), minlength=count) for a, b in pairs])
+        sums = self._sums(side, pairs)
         # restore the full rows from the symmetric half
         return np.asarray(sums[[0, 1, 2, 6, 1, 3, 4, 7, 2, 4, 5, 8, *range(9, 14)]])
+
+    def _sums(self, side: _ResampledFrame, pairs: list[tuple[Floats, Floats]]) -> NDArray[np.float64]:
+        """Return sums of products of maps over blocks ``(products, blocks)``."""
+        if side.shown is None:
+            return products_by_block(pairs, self.block)
+        place = [
+            np.clip(where // edge, 0, count - 1).astype(np.intp)
+            for where, edge, count in zip(side.shown, self.block, self.blocks, strict=True)
+        ]
+        number = (place[0] * self.blocks[1] + place[1]).ravel()
+        count = self.blocks[0] * self.blocks[1]
+        return np.stack([np.bincount(number, (a * b).ravel(), minlength=count) for a, b in pairs])
+
+    def without_noise(self, equations: _Equations, prior: float, v: Doubles, heights: Doubles) -> _Equations:
+        """Return equations whose second derivatives hold no noise of the slopes, if they still determine the motion.
+
+        Slopes of one frame, as the gradient uses them, times those of the other, whose noise is independent. Outliers count
+        with the derivative of weight times residual, which is negative.
+        """
+        total = np.zeros((len(PAIRS), len(heights)))
+        for side, derivatives in zip(self._resample(v, heights) or (), self.sides, strict=True):
+            weight = cauchy(side.after - side.before, side.scale)
+            weight *= np.float32(0.25) * (2 * weight - 1) * side.inside
+            frames, middle = (side.before, side.after), (side.before + side.after) * np.float32(0.5)
+            for used, seen in (frames, frames[::-1]):
+                slopes = slopes_of(used, self.level, side.scale, like=middle), central_differences(seen)
+                one, other = (by[0] * derivatives[:, 0] + by[1] * derivatives[:, 1] for by in slopes)
+                one *= weight
+                total += self._sums(side, [(one[k], other[right]) for k, right in PAIRS])
+                total += self._sums(side, [(one[right], other[k]) for k, right in PAIRS])
+        # a block whose height the frames do not share keeps its prior height
+        shared = total[9] > 0
+        normal = total[[0, 1, 2, 1, 4, 5, 2, 5, 7]].reshape(3, 3, -1)
+        clean = equations._replace(normal=normal, cross=total[[3, 6, 8]] * shared, height=total[9] * shared)
+        return clean if np.linalg.eigvalsh(clean.reduced_normals(prior).sum(axis=-1))[0] > 0 else equations
 
     def _places(self, shift: Floats) -> tuple[Floats, Floats]:
         """Return rows and columns of displaced cells."""
@@ -658,27 +693,35 @@ def registered_over_relief(
     assert equations is not None
     assert heights is not None
     lean_gradients = relief_level.gradients_by_lean(v, heights) if any(attitude.unsure) else None
-    return v, _assessed(equations, prior, heights - relief_level.mean, level, lean_gradients, converged=converged)
+    equations = relief_level.without_noise(equations, prior, v, heights)
+    return v, _assessed(equations, prior, heights - relief_level.mean, relief_level, lean_gradients, converged=converged)
 
 
 def _assessed(
     equations: _Equations,
     prior: float,
-    height_offsets: NDArray[np.float64],
-    level: DirectLevel,
-    lean_gradients: NDArray[np.float64] | None,
+    height_offsets: Doubles,
+    level: _ReliefLevel,
+    lean_gradients: Doubles | None,
     *,
     converged: bool,
 ) -> Fit:
     """Return the fit: covariance, and sensitivity to the mean height and to differences of height, pitch and roll.
 
-    The covariance is that of the blocks' gradients, which include all errors common to a block: noise, speckle, relief.
+    The covariance is the jackknife's over blocks, whose gradients include all errors common to a block: noise, speckle,
+    relief.
     """
-    # motion per gradient, with the heights eliminated; the change by each block gives the covariance
-    normal, _ = equations.without_heights(prior, height_offsets)
+    # motion per gradient, with the heights eliminated
+    normals, gradients = equations.reduced_normals(prior), equations.reduced_gradients(prior, height_offsets)
+    normal = normals.sum(axis=-1)
     inverse = np.linalg.inv(normal)
+    # the change without each of the blocks gives the covariance; where one holds all information, it is very large
+    left_out, pulls = (
+        by_block(values.reshape(*values.shape[:-1], *level.blocks), CORRELATED_BLOCKS) for values in (normals, gradients)
+    )
+    remaining = normal[..., None] * (1 + 1e-9) - left_out
+    changes = np.linalg.solve(np.moveaxis(remaining, -1, 0), pulls.T[..., None])[..., 0]
     prior_weight = equations.noise * prior
-    block_changes = inverse @ equations.reduced_gradients(prior, height_offsets)
     # these differences change the gradients of both motion and heights; eliminate the heights as above
     by_lean = np.zeros((3, 5))
     if lean_gradients is not None:
@@ -686,10 +729,10 @@ def _assessed(
         by_lean = inverse @ reduced.sum(axis=-1).T
     return Fit(
         converged=converged,
-        covariance=np.asarray(block_changes @ block_changes.T, dtype=np.float64),
+        covariance=np.asarray(changes.T @ changes, dtype=np.float64),
         by_height=inverse @ (equations.cross @ (prior_weight / (equations.height + prior_weight))),
         by_lean=by_lean,
         correlation=equations.correlation,
-        independent=equations.cells / correlated_cells(level),
+        independent=equations.cells / correlated_cells(level.level),
         blocks=spread_of(equations.height),
     )

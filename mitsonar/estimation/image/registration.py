@@ -883,16 +883,19 @@ def sampled(image: Floats, row: Floats, column: Floats) -> Floats:
     return np.asarray(cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def slopes_of(image: Floats, level: DirectLevel, scale: float) -> tuple[Floats, Floats]:
+def slopes_of(image: Floats, level: DirectLevel, scale: float, *, like: Floats | None = None) -> tuple[Floats, Floats]:
     """Return central differences over bins and beams of the denoised image (Wiener's filter).
 
-    ``scale`` is the standard deviation of a difference of two frames; their mean has half of it.
+    ``scale`` is the standard deviation of a difference of two frames; their mean has half of it. ``like``: the mean of both
+    frames, by which one of them is denoised.
     """
     smooth = blurred(image, *level.slopes)
     if scale > FAINTEST:
-        mean = cv2.blur(smooth, NEIGHBOURS)
-        variance = cv2.blur(smooth * smooth, NEIGHBOURS) - mean * mean
+        shown = smooth if like is None else blurred(like, *level.slopes)
+        mean = cv2.blur(shown, NEIGHBOURS)
+        variance = cv2.blur(shown * shown, NEIGHBOURS) - mean * mean
         wiener_gain = np.maximum(0, 1 - np.float32(2 * (scale / 2) ** 2) / np.maximum(variance, np.float32(1e-9)))
+        mean = mean if like is None else cv2.blur(smooth, NEIGHBOURS)
         smooth = mean + (smooth - mean) * wiener_gain
     return central_differences(smooth)
 
