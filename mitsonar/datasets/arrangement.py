@@ -66,7 +66,7 @@ class Labels:
             raise MitsonarError(f"unknown labels {kind!r}: {suggest_names(kind, LABELS)}")
         flight = recipe.flight
         if frames == 1:
-            low, high = flight.heights
+            low, high = (height + recipe.mount.up_m for height in flight.heights)  # of the sonar, not of its vehicle
             return cls(kind, np.array([low]), np.array([high]), ("height (m)",))
         limit = np.array([flight.sideways_mm / 1e3, flight.forward_mm / 1e3, np.radians(flight.yaw_deg)])
         return cls(kind, -limit, limit, ("sideways (m)", "forward (m)", "yaw (rad)"))
