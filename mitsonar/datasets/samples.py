@@ -610,7 +610,7 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
             self.pose[here],
             self.store.read("height_m", here),
             time_s=self.store.read("time_s", here),
-            level_scale=float(self.store.about["level_scale"]),
+            level_scale=self.store.level_scale_of(int(self.scene[here.start])),
         )
 
 
