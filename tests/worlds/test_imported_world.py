@@ -66,6 +66,20 @@ def test_a_scaled_mesh_a_colour_and_a_mimic_are_read(tmp_path: Path) -> None:
         imported_world(tmp_path / "crane.urdf", joints={"shoulder": np.nan})
 
 
+def test_a_colour_that_a_link_defines_holds_for_links_that_name_it(tmp_path: Path) -> None:
+    """As in ROS: without a material of the robot, the first visual that gives its colour defines it."""
+    links = "".join(
+        f'<link name="{name}"><visual><geometry><box size="1 1 1"/></geometry><material name="white">{colour}</material>'
+        "</visual></link>"
+        for name, colour in (("a", ""), ("b", '<color rgba="1 1 1 1"/>'), ("c", '<color rgba="0 0 0 1"/>'))
+    )
+    joints = "".join(
+        f'<joint name="{name}" type="fixed"><parent link="a"/><child link="{name}"/></joint>' for name in ("b", "c")
+    )
+    (tmp_path / "white.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    assert [mesh.reflectivity[0] for mesh in imported_world(tmp_path / "white.urdf").meshes] == pytest.approx([1, 1, 0])
+
+
 def test_degrees_in_place_of_radians_are_told(tmp_path: Path) -> None:
     box = '<visual><geometry><box size="1 1 1"/></geometry></visual>'
     joint = '<joint name="hinge" type="continuous"><parent link="a"/><child link="b"/><origin rpy="0 90 0"/></joint>'
