@@ -27,8 +27,10 @@ from torch import Tensor, nn
 from mitsonar.config.data import Recipe, Split
 from mitsonar.datasets.arrangement import Coordinates, LabelKind, Labels, Layout
 from mitsonar.datasets.modality import Fields
-from mitsonar.datasets.sample_index import Part, split_for
+from mitsonar.datasets.plan import scenes_of
+from mitsonar.datasets.sample_index import first_frames, split_for
 from mitsonar.datasets.samples import Batches, ground_at
+from mitsonar.datasets.store import DataStore, world_numbers
 from mitsonar.errors import MitsonarError, did_you_mean, short_repr, validation_message
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
@@ -264,15 +266,16 @@ class Checkpoint:
             return np.zeros(len(samples), dtype=bool)
         # 1. First frames of the samples of training: its part of the split, cut to the share of the data that it used.
         fraction, length = self.recipe.get("part_of_data"), self.arrangement["frames"]
-        seen = Part.of(samples.store, "train", split, length)
+        world, sequence, place = _frames_of_training(samples.store, self.trained.get("sequences"))
         share = fraction if isinstance(fraction, int | float) else 1.0
-        first = seen.first[seen.first + length <= share * len(samples.store)]
-        used = np.zeros(len(samples.store) + length, dtype=bool)  # motions from each frame to the next
+        first = first_frames(world, sequence, split, "train", length)
+        first = first[first + length <= share * len(sequence)]
+        used = np.zeros(len(sequence) + max(length, samples.frames), dtype=bool)  # motions from each frame to the next
         for step in range(max(length - 1, 1)):
             used[first + step] = True
         # 2. A sample counts as seen if training has seen every motion between its frames.
         steps = range(max(samples.frames - 1, 1))
-        return np.asarray(np.all([used[samples.first + step] for step in steps], axis=0))
+        return np.asarray(np.all([used[place[samples.first] + step] for step in steps], axis=0))
 
     def decode(self, output: Tensor | GaussianHead) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
         """Decode the output of the network.
@@ -400,6 +403,32 @@ class Checkpoint:
         else:
             return cls(**{one.name: table[one.name] for one in fields(cls)})
         raise MitsonarError(f"{source} is damaged: {reason}; train again, or use an intact copy")
+
+
+def _frames_of_training(
+    store: DataStore, sequences: object
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+    """Return the frames of a training on a data set of this recipe, of which the store may hold more or fewer sequences.
+
+    Args:
+        store: data set to evaluate on.
+        sequences: number of sequences in training; those of the store if it is unknown.
+
+    Returns:
+        World and sequence of each frame of training ``(n,)``, and the number in training of each frame of the store, n for
+        frames that training did not have.
+    """
+    recipe, scene, sequence = store.recipe, store.read("scene"), store.read("sequence")
+    if type(sequences) is not int or sequences == store.about["sequences"] or recipe.flight.kind != "random":
+        return world_numbers(recipe, store.scenes)[scene], sequence, np.arange(len(scene))
+    # Both begin with the same sequences in each scene.
+    scenes, pings = {one.number: one for one in scenes_of(recipe, sequences)}, recipe.flight.pings
+    place, begin = np.full(len(scene), sequences * pings), 0
+    for number, one in scenes.items():
+        common = np.flatnonzero(scene == number)[: one.sequences * pings]
+        place[common], begin = begin + np.arange(len(common)), begin + one.sequences * pings
+    numbers = np.repeat(list(scenes), [one.sequences * pings for one in scenes.values()])
+    return world_numbers(recipe, scenes)[numbers], np.repeat(np.arange(sequences, dtype=np.int32), pings), place
 
 
 def _numbers_in(options: Fields) -> list[tuple[str, float]]:

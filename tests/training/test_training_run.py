@@ -26,6 +26,7 @@ from scipy.stats import multivariate_normal
 from typer.testing import CliRunner
 
 from mitsonar.datasets.make import make_dataset
+from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.io.runs import differences
 
@@ -545,6 +546,7 @@ def test_a_stop_leaves_a_network_and_a_row_of_the_log(made: Path, tmp_path: Path
     stored = Checkpoint.load(tmp_path / "run")
     (row,) = csv.DictReader((tmp_path / "run" / "log.csv").open())
     assert (stored.trained["steps"], int(row["step"])) == (1, 1)
+    assert stored.trained["sequences"] == DataStore.open(made).about["sequences"]
     assert float(row["none sideways (mm)"]) == pytest.approx(stored.metrics["none"]["rmse"][0], rel=1e-4)
     (tmp_path / "run" / "network.ckpt").unlink()
     with pytest.raises(
