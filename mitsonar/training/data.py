@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from mitsonar.config.training import TrainingRecipe
 from mitsonar.datasets.make import calibrate
 from mitsonar.datasets.rendered import RawStream, RenderedPairs
 from mitsonar.datasets.samples import ImpulsePairs, JoinedPairs, SonarPairs
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.io.runs import digest
 from mitsonar.simulation.device import ensure_variant
 
@@ -185,8 +186,37 @@ def _stored(recipe: TrainingRecipe, sets: list[str | Path]) -> Material:
             f"{' and '.join(map(str, sets))}: {len(numbers)} samples for training, fewer than a batch of {recipe.batch}: "
             "make more, or lower batch"
         )
-    validation = _validation(recipe, _joined(recipe, sets, "validation", labels="raw"))
+    unseen = _joined(recipe, sets, "validation", labels="raw")
+    validation = _validation(recipe, unseen)
+    if isinstance(pairs, JoinedPairs) and isinstance(unseen, JoinedPairs):
+        _warn_of_common_samples(_shown_by(pairs, numbers.tolist()), _shown_by(unseen, validation.rows))
     return Material(pairs, numbers, len(numbers), validation, _about(pairs))
+
+
+def _shown_by(pairs: JoinedPairs, numbers: Sequence[int | RawSample]) -> list[tuple[str, int, bytes]]:
+    """Return what tells whether two samples of rendered data sets show one motion over one world: world and first pose."""
+    shown = []
+    for part in pairs.parts:
+        recipe, scenes = part.recipe, part.store.scenes
+        worlds = {number: "" if recipe.recorded else repr(recipe.family(one.group)) for number, one in scenes.items()}
+        for first in part.first.tolist():
+            scene = int(part.scene[first])
+            shown.append((worlds[scene], scenes[scene].seed, part.pose[first].tobytes()))
+    return [shown[number] for number in numbers if isinstance(number, int)]
+
+
+def _warn_of_common_samples(training: list[tuple[str, int, bytes]], validation: list[tuple[str, int, bytes]]) -> None:
+    """Warn if data sets of one seed, but of other sizes, put one motion over one world into training and validation."""
+    known = set(training)
+    common = sum(one in known for one in validation)
+    if common:
+        warnings.warn(
+            f"{common} of {len(validation)} validation samples show a motion over a world that training sees in another "
+            "data set, so errors of validation are too small: make one of the data sets with another --seed, or both with "
+            "the same scenes and sequences",
+            MitsonarWarning,
+            stacklevel=4,
+        )
 
 
 def _joined(recipe: TrainingRecipe, sets: list[str | Path], part: str, **options: str) -> Stored:

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from typer.testing import CliRunner
 
 from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.store import DataStore
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.io.runs import differences
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
@@ -337,6 +338,25 @@ def test_two_data_sets_are_learnt_from_as_one(made: Path, other: Path) -> None:
     assert len(np.unique(samples.sequence[firsts])) == len(joined.validation) == 15  # one a sequence
     assert (joined.about["name"], joined.about["gain"]) == ("tiny and other", None)
     assert joined.about["digest"] != material_of(message, [other, made], render=False).about["digest"]
+
+
+def test_a_motion_in_training_of_one_set_and_validation_of_another_is_told(made: Path, tmp_path: Path) -> None:
+    """Two models of one recipe: a shorter set has the same sequences, but they are divided anew."""
+    for name, sequences in (("short", 14), ("whole", None)):
+        changes = {"name": name, "scenes": [{"count": 2, "sequences": 10}], "sonar__model": "physical", "gain": 0.02}
+        make_dataset(tiny_recipe(**changes), str(tmp_path / name), sequences=sequences)
+    message = recipe(split={"train": 0.5, "validation": 0.5}, validate={"pairs": None, "noise": ["none"]})
+    with pytest.warns(MitsonarWarning, match="validation samples show a motion over a world that training sees") as warned:
+        joined = material_of(message, [made, tmp_path / "short"], render=False)
+    samples, unseen = joined.samples, joined.validation.samples
+    assert isinstance(samples, JoinedPairs)
+    assert isinstance(unseen, JoinedPairs)
+    taught = {part.pose[first].tobytes() for part in samples.parts for first in part.first}
+    common = sum(part.pose[first].tobytes() in taught for part in unseen.parts for first in part.first)
+    assert str(warned[0].message).startswith(f"{common} of {len(unseen)} validation samples")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        material_of(message, [made, tmp_path / "whole"], render=False)
 
 
 def test_a_network_of_two_models_names_both(made: Path, other: Path, tmp_path: Path) -> None:
