@@ -172,7 +172,8 @@ def material_of(
     share = world.split.train if recipe.split == world.split.by else 1.0
     per_sequence = world.flight.pings - samples.frames + 1
     validation = _rendered_validation(recipe, world, gain) if stored is None else _validation(recipe, stored)
-    about = {"name": world.name, "digest": world.digest("rendered"), "gain": gain}
+    validated_on = [] if stored is None else [len(stored.store)]  # else --resume could exchange the validation samples
+    about = {"name": world.name, "digest": world.digest("rendered", *validated_on), "gain": gain}
     return Material(
         samples, None, max(1, round(world.sequences * share * recipe.part_of_data)) * per_sequence, validation, about
     )

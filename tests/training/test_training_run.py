@@ -359,6 +359,15 @@ def test_a_motion_in_training_of_one_set_and_validation_of_another_is_told(made:
         material_of(message, [made, tmp_path / "whole"], render=False)
 
 
+def test_rendering_is_not_resumed_with_other_validation_samples(made: Path, tmp_path: Path) -> None:
+    """The best network would be chosen among errors on two sets of samples."""
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(DataStore.open(made).about["recipe"], sort_keys=False))
+    message = recipe(data=str(tmp_path / "tiny.yaml"), validate={"pairs": 2, "noise": ["none"]})
+    about = [material_of(message, data, render=True, gain=0.02).about for data in (made, None)]
+    assert about[0]["name"] == about[1]["name"]
+    assert about[0]["digest"] != about[1]["digest"]
+
+
 def test_a_network_of_two_models_names_both(made: Path, other: Path, tmp_path: Path) -> None:
     stored = train(TrainOptions(recipe(steps=2), [made, other], tmp_path / "run", threads=1, workers=0))
     assert (stored.model, stored.data) == ("thesis and physical", "tiny and other")
