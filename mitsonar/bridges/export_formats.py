@@ -191,11 +191,16 @@ def _yolo_lines(region: Region, size: tuple[int, int], polygons: bool) -> list[s
 
 
 def _outlines(region: Region) -> list[np.ndarray[tuple[int, ...], np.dtype[np.float64]]]:
-    """Return the outer outlines of a region ``(points, 2)`` through pixel centres, without those of fewer than 3 points."""
+    """Return the outer outlines of a region ``(points, 2)`` through pixel centres; a line of pixels becomes a rectangle."""
     import cv2
 
     contours, _ = cv2.findContours(region.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    return [contour[:, 0, :].astype(float) + 0.5 for contour in contours if len(contour) >= 3]
+    outlines = []
+    for contour in contours:
+        column, row, width, height = cv2.boundingRect(contour)
+        corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * (width, height) + (column, row)
+        outlines.append(contour[:, 0, :].astype(float) + 0.5 if len(contour) >= 3 else corners.astype(float))
+    return outlines
 
 
 # ---------------- Data set recipe for a detector

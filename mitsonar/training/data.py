@@ -195,7 +195,7 @@ def _stored(recipe: TrainingRecipe, sets: list[str | Path]) -> Material:
 
 
 def _shown_by(pairs: JoinedPairs, numbers: Sequence[int | RawSample]) -> list[tuple[str, int, bytes]]:
-    """Return what tells whether two samples of rendered data sets show one motion over one world: world and first pose."""
+    """Return world, seed and first pose of samples, which are equal if two of them show one motion over one world."""
     shown = []
     for part in pairs.parts:
         recipe, scenes = part.recipe, part.store.scenes

@@ -144,7 +144,10 @@ def test_yolo_has_a_line_an_object(mitsonar: Command, run: Path, frames: SonarFr
         np.testing.assert_allclose(rows[1, 1:], [5.5 / BEAMS, (8.5 + number) / BINS, 5 / BEAMS, 7 / BINS], atol=1e-6)
     cv2 = pytest.importorskip("cv2")
     assert mitsonar(*words, "-o", tmp_path / "outlines", "--polygons").returncode == 0
-    for line in (tmp_path / "outlines" / "labels" / "train" / "000001.txt").read_text().splitlines()[-2:]:
+    wall, *barrels = (tmp_path / "outlines" / "labels" / "train" / "000001.txt").read_text().splitlines()
+    corners = np.array([(2, 30), (20, 30), (20, 31), (2, 31)]) / (BEAMS, BINS)  # one bin high, which has no outline
+    np.testing.assert_allclose(np.array(wall.split(), float), [0, *corners.ravel()], atol=1e-6)
+    for line in barrels:
         kind, *numbers = line.split()
         points = np.array(numbers, float).reshape(-1, 2) * (BEAMS, BINS) - 0.5
         drawn = cv2.fillPoly(np.zeros((BINS, BEAMS), np.uint8), [points.round().astype(np.int32)], 1)
