@@ -303,9 +303,9 @@ def new_folder(out: Path) -> Iterator[Path]:
     Raises:
         MitsonarError: ``out`` exists, or a foreign folder has the temporary name.
     """
-    part = out.with_name(f".{out.name}.part")
-    if out.exists():
+    if out.exists():  # so does ".", which has no name
         raise MitsonarError(f"{out} exists and is kept as it is: choose another -o, or remove it")
+    part = out.with_name(f".{out.name}.part")
     if part.exists() and not (part / MARKER).is_file():
         raise MitsonarError(f"{part} exists and is not an unfinished export of mitsonar: remove it, or choose another -o")
     try:

@@ -319,6 +319,7 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
     (tmp_path / "there").mkdir()
     words = ("frames", "export", run, "-o")
     refused(mitsonar(*words, tmp_path / "there", "--to", "coco"), "exists and is kept")
+    refused(mitsonar(*words, ".", "--to", "coco"), "exists and is kept")
     refused(mitsonar(*words, tmp_path / "new", "--to", "cocoa"), "unknown layout", "coco")
     refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--picture", "round"), "polar or fan")
     refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--without", "sandy"), "no shape is named", "sand")
