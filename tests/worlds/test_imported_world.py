@@ -168,6 +168,22 @@ def test_frames_models_and_includes_are_placed_in_closed_form(tmp_path: Path) ->
     np.testing.assert_array_equal(middle_of(scoped, "pier::door"), middle_of(opened, "pier::door"))
 
 
+def test_a_joint_to_a_link_of_a_nested_model_moves_that_model(tmp_path: Path) -> None:
+    """A quarter turn about the base, 2 m away, of the arm and of what it carries."""
+    shape = '<visual name="v"><geometry><box><size>1 1 1</size></box></geometry></visual>'
+    hand = f'<model name="hand"><pose>1 0 0 0 0 0</pose><link name="palm">{shape}</link></model>'
+    (tmp_path / "rov.sdf").write_text(
+        f'<sdf version="1.9"><model name="rov"><link name="base">{shape}</link>'
+        f'<model name="arm"><pose>2 0 0 0 0 0</pose><link name="bar">{shape}</link>{hand}</model>'
+        '<joint name="elbow" type="revolute"><pose relative_to="base"/><parent>base</parent><child>arm::bar</child>'
+        "<axis><xyz>0 0 1</xyz></axis></joint></model></sdf>"
+    )
+    for angle, bar, palm in ((0.0, (2, 0, 0), (3, 0, 0)), (np.pi / 2, (0, 2, 0), (0, 3, 0))):
+        world = imported_world(tmp_path / "rov.sdf", joints={"elbow": angle})
+        np.testing.assert_allclose(middle_of(world, "rov::arm::bar"), bar, atol=1e-9)
+        np.testing.assert_allclose(middle_of(world, "rov::arm::hand::palm"), palm, atol=1e-9)
+
+
 def test_what_a_harbour_cannot_hold_is_left_out_with_a_warning(tmp_path: Path) -> None:
     make_sdf(tmp_path)
     swapped = SDF.replace("<sphere><radius>0.2</radius></sphere>", "<heightmap><uri>a.png</uri></heightmap>")
