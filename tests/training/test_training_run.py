@@ -197,6 +197,7 @@ def test_recipes_say_what_they_leave_out(tmp_path: Path) -> None:
         ({"noise": "loud"}, "noise must be none, low, high"),
         ({"noise": []}, "empty list"),
         ({"epochs": 3}, "either epochs or steps"),
+        ({"epochs": np.inf, "steps": None}, "epochs: input should be a finite number"),
         ({"split": "world"}, "split must be sequence, scene"),
         ({"split": {"trian": 0.9}}, "did you mean train"),
         ({"loss": {"kind": "likelihood", "penalty": 1}}, "penalty applies only to kind mse"),
