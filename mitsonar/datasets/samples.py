@@ -604,7 +604,8 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         sample = {key: np.asarray(values)[None] for key, values in self.raw(index).items()}
         if image is not None:
             sample[name] = image[None]
-        image = self.arrange.noisy(sample, name, sample["frames"], self.epoch_seed)[0]
+        arrange = self.arrange.for_sample(sample["frames"][0], self.epoch_seed)
+        image = arrange.noisy(sample, name, sample["frames"], self.epoch_seed)[0]
         return self.frames_of(
             np.asarray(image),
             self.pose[here],

@@ -191,6 +191,9 @@ def test_frames_for_estimators(made: Path) -> None:
     np.testing.assert_array_equal(frames.poses, pairs.store.read("pose")[pairs.frame_slice(17)])
     np.testing.assert_array_equal(frames.height_m, [2.5, 2.5])
     assert frames.sonar.beams == 12
+    drawn = SonarPairs(made, part="all", noise=["low", "high"], layout="channels")  # each sample draws its level
+    for index in range(0, 120, 12):
+        np.testing.assert_array_equal(drawn.sonar_frames(index).image, drawn[index][0].numpy())
 
 
 # ---------------------------------------------------------------- labels
