@@ -557,6 +557,14 @@ def test_worlds_of_a_recipe_are_split_by_scene(tmp_path: Path) -> None:
     assert rules == [("seabed", "")]
 
 
+def test_recipes_of_runs_give_random_views_and_those_of_scene_files_the_file(tmp_path: Path) -> None:
+    assert detector_recipe("pattern-runs", DetectorViews(12))[0].flight.kind == "random"
+    world = {"family": "scene", "file": "wreck/scene.xml", "size_m": 20}
+    (tmp_path / "own.yaml").write_text(json.dumps({**TINY, "world": world}))
+    with pytest.raises(MitsonarError, match=r"flies over the scene .*scene\.xml: give that file in place of the recipe"):
+        detector_recipe(tmp_path / "own.yaml", DetectorViews(12))
+
+
 def test_views_of_a_scene_are_clear_of_its_objects_and_drawn_in_pitch(tmp_path: Path, variant: str) -> None:
     from mitsonar.datasets.plan import Plan
 
