@@ -82,7 +82,8 @@ class Checkpoint:
         recipe: of the training.
         metrics: of validation, keyed by noise level: ``{"none": {"rmse": [sideways mm, forward mm, yaw deg], "pairs":
             500}}``; for heights rmse is ``[mm]``.
-        trained: number of pairs, minutes, epochs, seed ...
+        trained: number of pairs, minutes, epochs, seed ...; and ``sequences``, the number of each data set, keyed by the
+            digest of its recipe.
         version: of the mitsonar that wrote the file.
         format: :data:`FORMAT`.
     """
@@ -251,9 +252,15 @@ class Checkpoint:
         Raises:
             MitsonarError: the file has no valid split.
         """
-        if self.trained.get("rendered") or self.data_recipe != recipe.model_dump(mode="json"):
+        used = self.data_recipe == recipe.model_dump(mode="json") or self._sequences_of_training(recipe) is not None
+        if self.trained.get("rendered") or not used:
             return None
         return split_for(self.recipe.get("split"), recipe)
+
+    def _sequences_of_training(self, recipe: Recipe) -> object:
+        """Return the number of sequences of a recipe in training; None if it is unknown, as in files of earlier versions."""
+        counts = self.trained.get("sequences")
+        return counts.get(recipe.digest()) if isinstance(counts, dict) else None
 
     def learnt(self, samples: SonarPairs | ImpulseSamples) -> NDArray[np.bool_]:
         """Mark the samples ``(samples,)`` of a data set that training may have seen: those whose motions it all used.
@@ -266,7 +273,7 @@ class Checkpoint:
             return np.zeros(len(samples), dtype=bool)
         # 1. First frames of the samples of training: its part of the split, cut to the share of the data that it used.
         fraction, length = self.recipe.get("part_of_data"), self.arrangement["frames"]
-        world, sequence, place = _frames_of_training(samples.store, self.trained.get("sequences"))
+        world, sequence, place = _frames_of_training(samples.store, self._sequences_of_training(samples.recipe))
         share = fraction if isinstance(fraction, int | float) else 1.0
         first = first_frames(world, sequence, split, "train", length)
         first = first[first + length <= share * len(sequence)]
@@ -319,6 +326,7 @@ class Checkpoint:
             sonars = [
                 f"{received.name}, {received.carrier_hz:g} Hz, {received.bandwidth_hz:g} Hz wide, {received.taps} taps"
             ]
+        trained = {name: value for name, value in self.trained.items() if not isinstance(value, dict)}
         spans = zip(self.labels["names"], self.labels["low"], self.labels["high"], strict=True)
         rows = [
             ("network", f"{self.network}{options}"),
@@ -327,7 +335,7 @@ class Checkpoint:
             ("labels", f"{self.labels['kind']}: " + ", ".join(f"{name} {low:.4g}..{high:.4g}" for name, low, high in spans)),
             ("sonar", "; ".join(dict.fromkeys(sonars)) or "any"),
             ("trained on", f"{self.data}, {self.model} model, noise {self.noise}; {self.fixed}"),
-            ("trained for", ", ".join(f"{name} {_number(value)}" for name, value in self.trained.items()) or "not recorded"),
+            ("trained for", ", ".join(f"{name} {_number(value)}" for name, value in trained.items()) or "not recorded"),
         ]
         for level, scores in self.metrics.items():
             rmse = scores.get("rmse") if isinstance(scores, dict) else None

@@ -238,14 +238,16 @@ def _joined(recipe: TrainingRecipe, sets: list[str | Path], part: str, **options
 def _about(pairs: Stored) -> JsonObject:
     """Return name, digest and gain of the data, which must be the same in a resumed run; joined data sets have no gain.
 
-    ``sequences`` is the number of sequences in the data set, or in the first one.
+    ``sequences`` has the number of sequences in each data set, keyed by the digest of its recipe.
     """
     if not isinstance(pairs, JoinedPairs):
         data_digest, gain = pairs.recipe.digest(len(pairs.store)), pairs.store.about.get("gain")
-        return {"name": pairs.recipe.name, "digest": data_digest, "gain": gain, "sequences": pairs.store.about["sequences"]}
+        sequences = {pairs.recipe.digest(): pairs.store.about["sequences"]}
+        return {"name": pairs.recipe.name, "digest": data_digest, "gain": gain, "sequences": sequences}
     digests = [part.recipe.digest(len(part.store)) for part in pairs.parts]
-    names, sequences = pairs.described()["data"], pairs.parts[0].store.about["sequences"]
-    return {"name": names, "digest": digest(" ".join(digests))[:16], "gain": None, "sequences": sequences}
+    sequences = {part.recipe.digest(): part.store.about["sequences"] for part in pairs.parts}
+    total = digest(" ".join(digests))[:16]
+    return {"name": pairs.described()["data"], "digest": total, "gain": None, "sequences": sequences}
 
 
 def _part(recipe: TrainingRecipe, data: str | Path, part: str, **options: str) -> SonarPairs | ImpulsePairs:

@@ -429,7 +429,7 @@ def test_what_was_learnt_is_known_in_a_shorter_data_set_of_the_recipe(made: Path
         if by == "scene" and count == 10:
             continue  # a single scene has no parts
         taught = SonarPairs(trained, part="train", split=split, labels="normx10")
-        about: JsonObject = {"recipe": {"split": split}, "trained": {"sequences": count}}
+        about: JsonObject = {"recipe": {"split": split}, "trained": {"sequences": {recipe.digest(): count}}}
         network, everything = constant(taught, **about), SonarPairs(other, part="all")
         poses = {taught.pose[first].tobytes() for first in taught.first}
         expected = [everything.pose[first].tobytes() in poses for first in everything.first]

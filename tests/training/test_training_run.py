@@ -374,6 +374,11 @@ def test_a_network_of_two_models_names_both(made: Path, other: Path, tmp_path: P
     assert (stored.model, stored.data) == ("thesis and physical", "tiny and other")
     report = evaluate(stored, str(other), part="all", noise=["none"])
     assert not [note for note in report["notes"] if "model" in note]
+    for data, pairs in ((made, 20), (other, 10)):  # also of the second data set
+        taught = SonarPairs(data, split="sequence")
+        seen = len(np.unique(taught.sequence[taught.first]))
+        notes = evaluate(stored, str(data), part="all", noise=["none"])["notes"]
+        assert f"training has seen {seen} of these {pairs} pairs" in notes[0]
     with pytest.raises(MitsonarError, match="begun with data tiny and other, not tiny"):
         train(TrainOptions(recipe(steps=2), made, tmp_path / "run", resume=True, threads=1, workers=0))
 
@@ -576,7 +581,7 @@ def test_a_stop_leaves_a_network_and_a_row_of_the_log(made: Path, tmp_path: Path
     stored = Checkpoint.load(tmp_path / "run")
     (row,) = csv.DictReader((tmp_path / "run" / "log.csv").open())
     assert (stored.trained["steps"], int(row["step"])) == (1, 1)
-    assert stored.trained["sequences"] == DataStore.open(made).about["sequences"]
+    assert stored.trained["sequences"] == {DataStore.open(made).recipe.digest(): 20}
     assert float(row["none sideways (mm)"]) == pytest.approx(stored.metrics["none"]["rmse"][0], rel=1e-4)
     (tmp_path / "run" / "network.ckpt").unlink()
     with pytest.raises(
