@@ -102,8 +102,10 @@ def first_frames(
     first = np.arange(max(0, len(sequence) - frames + 1))
     first = first[sequence[first] == sequence[first + frames - 1]]
     if split.by == "sample":
-        return first[samples_in_part(sequence[first], split, part)]
-    return first[frames_in_part(world, sequence, split, part)[first]]
+        chosen = samples_in_part(sequence[first], split, part)
+    else:
+        chosen = frames_in_part(world, sequence, split, part)[first]
+    return np.asarray(first[chosen])
 
 
 def split_for(split: AnySplit, recipe: Recipe) -> Split:

@@ -77,7 +77,8 @@ def test_a_colour_that_a_link_defines_holds_for_links_that_name_it(tmp_path: Pat
         f'<joint name="{name}" type="fixed"><parent link="a"/><child link="{name}"/></joint>' for name in ("b", "c")
     )
     (tmp_path / "white.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
-    assert [mesh.reflectivity[0] for mesh in imported_world(tmp_path / "white.urdf").meshes] == pytest.approx([1, 1, 0])
+    for mesh, reflectivity in zip(imported_world(tmp_path / "white.urdf").meshes, (1, 1, 0), strict=True):
+        assert mesh.reflectivity == pytest.approx(reflectivity)
 
 
 def test_degrees_in_place_of_radians_are_told(tmp_path: Path) -> None:
