@@ -48,6 +48,7 @@ from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.motion.trajectory import CONVENTIONS
 from mitsonar.records.frames import to_float32
 from mitsonar.simulation.scene import covered_squares_in, find_scene, load_scene, shape_boxes_in, shape_names_in, sonar_in
+from mitsonar.worlds.scene_check import SceneFile
 
 __all__ = [
     "EXPORTS",
@@ -191,11 +192,16 @@ def _yolo_lines(region: Region, size: tuple[int, int], polygons: bool) -> list[s
 
 
 def _outlines(region: Region) -> list[np.ndarray[tuple[int, ...], np.dtype[np.float64]]]:
-    """Return the outer outlines of a region ``(points, 2)`` through pixel centres, without those of fewer than 3 points."""
+    """Return the outer outlines of a region ``(points, 2)`` through pixel centres; a line of pixels becomes a rectangle."""
     import cv2
 
     contours, _ = cv2.findContours(region.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    return [contour[:, 0, :].astype(float) + 0.5 for contour in contours if len(contour) >= 3]
+    outlines = []
+    for contour in contours:
+        column, row, width, height = cv2.boundingRect(contour)
+        corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * (width, height) + (column, row)
+        outlines.append(contour[:, 0, :].astype(float) + 0.5 if len(contour) >= 3 else corners.astype(float))
+    return outlines
 
 
 # ---------------- Data set recipe for a detector
@@ -256,8 +262,8 @@ def detector_recipe(
         sentences that explain automatic choices.
 
     Raises:
-        MitsonarError: there are fewer frames than parts; the scene, its sonar or its ground is missing; or a height lies
-            within the ground.
+        MitsonarError: there are fewer frames than parts; the scene, its sonar or its ground is missing; a height lies within
+            the ground; or the recipe is one of a scene file.
     """
     # 1. Start from the keys of the recipe, or from those derived from the scene.
     parts = sum(share > 0 for share in views.split)
@@ -272,7 +278,7 @@ def detector_recipe(
         fields["sonar"] = _sonar_fields(sonar)
     # 2. Apply the views: isolated pings anywhere, with the requested heights, pitches, noise and split.
     flight = fields["flight"]
-    flight |= {"pings": 1, "jump_m": None}
+    flight |= {"kind": "random", "pings": 1, "jump_m": None}
     flight |= {} if views.heights is None else {"height_m": list(views.heights)}
     if views.pitch_deg is not None:
         flight["pitch_deg"] = list(views.pitch_deg)
@@ -305,6 +311,9 @@ def _scenes(frames: int, worlds: Sequence[Keys]) -> list[Keys]:
 def _fields_from_recipe(name: str, views: DetectorViews) -> tuple[Keys, list[tuple[str, str]], list[str]]:
     """Return keys, class rules and notes for the worlds of a recipe. Worlds that depend on a seed are split by scene."""
     recipe = load_recipe(name)
+    files = [family.file for group in range(len(recipe.scenes)) if isinstance(family := recipe.family(group), SceneFile)]
+    if files:
+        raise MitsonarError(f"{name} flies over the scene {files[0]}: give that file in place of the recipe")
     groups = [group for group, scene in enumerate(recipe.scenes) for _ in range(scene.count)]
     target_worlds = max(3, len(views.noise_db), views.frames // FRAMES_PER_WORLD)
     chosen = [

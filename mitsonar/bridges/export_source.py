@@ -94,7 +94,8 @@ class ExportSource:
         part: part of each frame, ``train``, ``validation`` or ``test`` ``(frames,)``; without a split all are ``train``.
         read: function that reads a slice of the frames, with labels.
         about: description of the source, for metadata.
-        raised_db: level added to the noise of the sonar in each frame ``(frames,)`` [dB].
+        raised_db: level added to the noise of the sonar, relative to the full scale of ``like``, in each frame ``(frames,)``
+            [dB].
     """
 
     name: str
@@ -248,11 +249,14 @@ def _open_data_set(url: str, view: str | None, split: tuple[float, float, float]
             **label_maps,
         )
 
-    sequence = np.asarray(store.read("sequence"), dtype=np.int64)
+    sequence, like = np.asarray(store.read("sequence"), dtype=np.int64), read(slice(0, 0))
     about = str(store.about["recipe"].get("about") or store.recipe.name)
-    raised = store.recipe.noise_raised_db(scene)
+    # Noise is relative to full scale, which differs between recorded scenes of other gains.
+    scales = {number: store.level_scale_of(number) for number in store.scenes}
+    scale = np.array([scales[int(number)] for number in scene])
+    raised = store.recipe.noise_raised_db(scene) + 10 * np.log10(like.level_scale / scale)
     parts = _parts_by_split(store, split)
-    return ExportSource(url, len(store), sequence, read(slice(0, 0)), tuple(labels), True, parts, read, about, raised)
+    return ExportSource(url, len(store), sequence, like, tuple(labels), True, parts, read, about, raised)
 
 
 def _parts_by_split(store: DataStore, shares: tuple[float, float, float] | None) -> NDArray[np.str_]:
@@ -299,9 +303,9 @@ def new_folder(out: Path) -> Iterator[Path]:
     Raises:
         MitsonarError: ``out`` exists, or a foreign folder has the temporary name.
     """
-    part = out.with_name(f".{out.name}.part")
-    if out.exists():
+    if out.exists():  # so does ".", which has no name
         raise MitsonarError(f"{out} exists and is kept as it is: choose another -o, or remove it")
+    part = out.with_name(f".{out.name}.part")
     if part.exists() and not (part / MARKER).is_file():
         raise MitsonarError(f"{part} exists and is not an unfinished export of mitsonar: remove it, or choose another -o")
     try:
@@ -1066,7 +1070,7 @@ def recorded_recipe(sources: Sequence[FramesWithPoses], name: str, *, labels: bo
     low, high = _heights(stretches)
     pitch, roll = (float(np.round(np.degrees(np.median(poses[:, axis])), 2)) for axis in (3, 4))
     has_floats = any(stretch.part.like.image.dtype != np.uint8 for stretch in stretches)
-    raised_db = [source.raised_db for source in sources]
+    raised_db = [source.raised_db + _noise_above_db(source.axes.sonar, first.axes.sonar) for source in sources]
     bearings = first.axes.bearing_rad
     return recipe_from(
         {
@@ -1095,6 +1099,13 @@ def recorded_recipe(sources: Sequence[FramesWithPoses], name: str, *, labels: bo
             },
         }
     )
+
+
+def _noise_above_db(sonar: Sonar, other: Sonar) -> float:
+    """Return by how much the noise of a sonar exceeds that of another [dB]; 0 if the model has no noise of its own."""
+    if sonar.model != "coherent" or sonar.noise_level_db is None or other.noise_level_db is None:
+        return 0.0
+    return sonar.noise_level_db - other.noise_level_db
 
 
 def _sample_keys(sources: Sequence[FramesWithPoses]) -> dict[str, Any]:

@@ -136,7 +136,7 @@ def sources_of_data_set(
                 format="data set of mitsonar",
                 poses="its own",
                 axes=axes,
-                level_scale=float(store.about["level_scale"]),
+                level_scale=store.level_scale_of(number),
                 stretches=stretches,
                 left_out=int(counts[number]) - sum(map(len, stretches)),
                 notes=() if sources else notes,

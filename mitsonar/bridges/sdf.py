@@ -252,26 +252,33 @@ class _Reader:
             if pieces:
                 self.scene.bodies.append(Body(name, pose, pieces, groups))
         for model_name, inner in model.models.items():
-            self.collect(inner, model_pose @ model.scope.pose(model_name), groups)
+            self.collect(inner, model_pose @ link_poses[model_name], groups)
 
     def _link_poses(self, model: _Model) -> dict[str, Matrix]:
-        """Return the poses of links in their model; joints with a value move their child and everything attached to it."""
+        """Return the poses of links and nested models in their model.
+
+        Joints with a value move their child and everything attached to it. A joint to a link of a nested model moves that
+        model.
+        """
         # 1. Collect the parent of each link, and the motion of the joint between them in the axes of the model.
         links = [attribute_of(model.file, link, "name") for link in model.element.findall("link")]
-        poses = {link: model.scope.pose(link) for link in links}
+        poses = {name: model.scope.pose(name) for name in (*links, *model.models)}
         joints: dict[str, tuple[str, Matrix]] = {}
         for joint in model.element.findall("joint"):
             name = attribute_of(model.file, joint, "name")
-            parent, child = ((joint.findtext(tag) or "").strip() for tag in ("parent", "child"))
+            ends = [(joint.findtext(tag) or "").strip() for tag in ("parent", "child")]
+            parent, child = (nested if (nested := end.partition("::")[0]) in model.models else end for end in ends)
             if joint.get("type") in ("revolute", "continuous", "prismatic"):
                 self.joint_names.append(_joined(model.name, name))
             value = self.joints.get(_joined(model.name, name), self.joints.get(name, 0.0))
             joint_pose = model.scope.pose(name)
-            joints[child] = (parent, joint_pose @ self._joint_transform(model, joint, value) @ np.linalg.inv(joint_pose))
+            motion = joint_pose @ self._joint_transform(model, joint, value) @ np.linalg.inv(joint_pose)
+            if parent != child or child in links:  # not between two links of one nested model
+                joints[child] = (parent, motion)
         # 2. Apply the motions of all joints between each link and the root.
         if not self.joints:
             return poses
-        for link in links:
+        for link in poses:
             ancestor, seen = link, set[str]()
             while ancestor in joints:
                 if ancestor in seen:

@@ -68,7 +68,10 @@ def read_urdf(
     name = robot.get("name", "")
     group = (name,) if name and name not in links else ()
     scene.frames |= {name: np.eye(4) for name in group}
-    colours = {material.get("name", ""): material for material in robot.findall("material")}
+    colours: dict[str, Element] = {}
+    for material in (*robot.findall("material"), *robot.findall("link/visual/material")):
+        if material.get("name") and material.find("color") is not None:  # a visual may define what later ones name
+            colours.setdefault(material.get("name", ""), material)
     for link, element in links.items():
         pieces = [
             piece

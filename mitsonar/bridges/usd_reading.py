@@ -209,7 +209,8 @@ def _gprim(prim: Prim, kind: str) -> dict[str, Any]:
     if kind == "Cube":
         sizes = dict.fromkeys("xyz", values[0])
     if kind == "Plane":
-        sizes = {"x": values[0], "y": values[1]}
+        along_x = prim.GetAttribute("axis").Get(TIME) == UsdGeom.Tokens.x  # its width lies along z, and turns to y upright
+        sizes = dict(zip("yx" if along_x else "xy", values, strict=True))
     axis = prim.GetAttribute("axis")
     return {"kind": primitive, "sizes": sizes, "axis": str(axis.Get(TIME)).lower() if axis else "z"}
 

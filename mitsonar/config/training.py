@@ -199,7 +199,7 @@ class TrainingRecipe(_Part):
     loss: Loss = Field(default_factory=Loss)
     optimiser: Optimiser = Field(default_factory=Optimiser)
     batch: int = Field(4, ge=1, le=65_536, description="samples per step, over all devices")
-    epochs: float | None = Field(32.0, gt=0, description="passes over all samples; or steps")
+    epochs: float | None = Field(32.0, gt=0, allow_inf_nan=False, description="passes over all samples; or steps")
     steps: int | None = Field(None, ge=1, description="steps of the optimiser, instead of epochs")
     precision: Precision = Field("32-true", description="precision, as named by Lightning")
     validate_: Validate = Field(default_factory=Validate, alias="validate")

@@ -66,7 +66,7 @@ class Labels:
             raise MitsonarError(f"unknown labels {kind!r}: {suggest_names(kind, LABELS)}")
         flight = recipe.flight
         if frames == 1:
-            low, high = flight.heights
+            low, high = (height + recipe.mount.up_m for height in flight.heights)  # of the sonar, not of its vehicle
             return cls(kind, np.array([low]), np.array([high]), ("height (m)",))
         limit = np.array([flight.sideways_mm / 1e3, flight.forward_mm / 1e3, np.radians(flight.yaw_deg)])
         return cls(kind, -limit, limit, ("sideways (m)", "forward (m)", "yaw (rad)"))
@@ -157,8 +157,7 @@ class Arrangement:
         """Arrange a batch whose samples draw their noise levels; the order of the batch is preserved."""
         # 1. Draw the level of each sample, and group the samples by level.
         xp = array_namespace(numbers)
-        drawn, _ = uniform((numbers.shape[0], 1, 1), seed=seed + WHICH_LEVEL, frames=numbers[:, 0], like=numbers)
-        level = xp.floor(drawn[:, 0, 0] * len(self.levels))
+        level = self._drawn_levels(numbers, seed)
         groups = [(model, xp.nonzero(level == k)[0]) for k, model in enumerate(self.levels)]
         view_frames = {name: values for name, values in frames.items() if name.removeprefix("nonzero_") in self.views}
         # 2. Arrange each group with a single noise model.
@@ -178,6 +177,17 @@ class Arrangement:
             return xp.take(xp.concat(list(pieces), axis=0), order, axis=0)
 
         return tuple(map(joined, zip(*parts, strict=True))) if isinstance(parts[0], tuple) else joined(parts)
+
+    def _drawn_levels(self, numbers: ArrayOfAnyLibrary, seed: int) -> ArrayOfAnyLibrary:
+        """Draw the index of the noise level of each sample ``(batch,)`` from the numbers of its frames."""
+        drawn, _ = uniform((numbers.shape[0], 1, 1), seed=seed + WHICH_LEVEL, frames=numbers[:, 0], like=numbers)
+        return array_namespace(numbers).floor(drawn[:, 0, 0] * len(self.levels))
+
+    def for_sample(self, numbers: NDArray[np.int64], seed: int) -> Arrangement:
+        """Return the arrangement with the noise level that a sample draws, given the numbers of its frames ``(frames,)``."""
+        if not self.levels:
+            return self
+        return replace(self, noise=self.levels[int(self._drawn_levels(numbers[None], seed)[0])], levels=())
 
     def noisy(
         self, frames: Mapping[str, ArrayOfAnyLibrary], view: str, numbers: ArrayOfAnyLibrary, seed: int

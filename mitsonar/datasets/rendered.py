@@ -223,7 +223,7 @@ class RenderedPairs(IterableDataset[Batch], Samples):
         """
         here = slice(begin + first, begin + first + self.frames)
         if self.frames == 1:
-            target = vehicle[first : first + 1, 2]
+            target = poses[here, 2]
         elif self.ground:
             target = motions(poses[here]).mean(axis=0)
         else:

@@ -13,7 +13,7 @@ from mitsonar.datasets.modality import Fields
 from mitsonar.datasets.store import DataStore, frames_in_part, samples_in_part, world_numbers
 from mitsonar.errors import MitsonarError
 
-__all__ = ["AnySplit", "Part", "split_for"]
+__all__ = ["AnySplit", "Part", "first_frames", "split_for"]
 
 AnySplit: TypeAlias = str | Split | Fields | None
 """A split as a name, an object, or the keys of a recipe; None: the recipe's split."""
@@ -66,12 +66,7 @@ class Part:
         """
         resolved = split_for(split, store.recipe)
         scene, sequence, pose, motion = (store.read(name) for name in ("scene", "sequence", "pose", "motion"))
-        first = np.arange(max(0, len(sequence) - frames + 1))
-        first = first[sequence[first] == sequence[first + frames - 1]]
-        if resolved.by == "sample":
-            first = first[samples_in_part(sequence[first], resolved, part)]
-        else:
-            first = first[frames_in_part(world_numbers(store.recipe, store.scenes)[scene], sequence, resolved, part)[first]]
+        first = first_frames(world_numbers(store.recipe, store.scenes)[scene], sequence, resolved, part, frames)
         if not len(first):
             raise MitsonarError(
                 f"{store.place.url} has no sample of {frames} frames in part {part!r}: its sequences have "
@@ -87,6 +82,30 @@ class Part:
         """Return the slice of the store's frames that a sample holds."""
         first = int(self.first[index])
         return slice(first, first + self.frames)
+
+
+def first_frames(
+    world: NDArray[np.int64], sequence: NDArray[np.int32], split: Split, part: str, frames: int
+) -> NDArray[np.int64]:
+    """Return the first frame of each sample in a part ``(samples,)``.
+
+    Args:
+        world: number of the world of each frame ``(all frames,)``.
+        sequence: number of the sequence of each frame ``(all frames,)``.
+        split: assignment of the frames to parts.
+        part: ``train``, ``validation``, ``test``, or ``all``.
+        frames: number of frames per sample.
+
+    Raises:
+        MitsonarError: the part is unknown, or there are too few worlds, sequences or samples for the parts.
+    """
+    first = np.arange(max(0, len(sequence) - frames + 1))
+    first = first[sequence[first] == sequence[first + frames - 1]]
+    if split.by == "sample":
+        chosen = samples_in_part(sequence[first], split, part)
+    else:
+        chosen = frames_in_part(world, sequence, split, part)[first]
+    return np.asarray(first[chosen])
 
 
 def split_for(split: AnySplit, recipe: Recipe) -> Split:

@@ -604,13 +604,14 @@ class SonarPairs(StoredBatches, Samples, Dataset[Any]):
         sample = {key: np.asarray(values)[None] for key, values in self.raw(index).items()}
         if image is not None:
             sample[name] = image[None]
-        image = self.arrange.noisy(sample, name, sample["frames"], self.epoch_seed)[0]
+        arrange = self.arrange.for_sample(sample["frames"][0], self.epoch_seed)
+        image = arrange.noisy(sample, name, sample["frames"], self.epoch_seed)[0]
         return self.frames_of(
             np.asarray(image),
             self.pose[here],
             self.store.read("height_m", here),
             time_s=self.store.read("time_s", here),
-            level_scale=float(self.store.about["level_scale"]),
+            level_scale=self.store.level_scale_of(int(self.scene[here.start])),
         )
 
 

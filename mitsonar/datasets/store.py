@@ -196,6 +196,13 @@ class DataStore:
         """Return the scenes, keyed by number."""
         return {int(fields["number"]): Scene(**fields) for fields in self.about["scenes"]}
 
+    def level_scale_of(self, scene: int) -> float:
+        """Return the level of a pixel of value 1 in a scene; scenes of recorded frames keep the gain of their source."""
+        recorded = self.recipe.recorded
+        if recorded is None:
+            return float(self.about["level_scale"])
+        return recorded.sources[self.scenes[scene].group].level_scale
+
     def array(self, name: str) -> zarr.Array[Any]:
         """Return the array with the given name.
 

@@ -646,7 +646,7 @@ def _open_data_set(url: str, sequence: int | None, view: str | None) -> FrameSou
     here, number, which = sequence_in(store, sequence)
     image = store.array(chosen.array)
     return FrameSource.of_arrays(
-        chosen.like,
+        replace(chosen.like, level_scale=store.level_scale_of(int(store.read("scene", here)[0]))),
         store.read("time_s", here),
         store.read("pose", here),
         store.read("height_m", here),

@@ -27,8 +27,10 @@ from torch import Tensor, nn
 from mitsonar.config.data import Recipe, Split
 from mitsonar.datasets.arrangement import Coordinates, LabelKind, Labels, Layout
 from mitsonar.datasets.modality import Fields
-from mitsonar.datasets.sample_index import Part, split_for
+from mitsonar.datasets.plan import scenes_of
+from mitsonar.datasets.sample_index import first_frames, split_for
 from mitsonar.datasets.samples import Batches, ground_at
+from mitsonar.datasets.store import DataStore, world_numbers
 from mitsonar.errors import MitsonarError, did_you_mean, short_repr, validation_message
 from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
@@ -80,7 +82,8 @@ class Checkpoint:
         recipe: of the training.
         metrics: of validation, keyed by noise level: ``{"none": {"rmse": [sideways mm, forward mm, yaw deg], "pairs":
             500}}``; for heights rmse is ``[mm]``.
-        trained: number of pairs, minutes, epochs, seed ...
+        trained: number of pairs, minutes, epochs, seed ...; and ``sequences``, the number of each data set, keyed by the
+            digest of its recipe.
         version: of the mitsonar that wrote the file.
         format: :data:`FORMAT`.
     """
@@ -249,9 +252,15 @@ class Checkpoint:
         Raises:
             MitsonarError: the file has no valid split.
         """
-        if self.trained.get("rendered") or self.data_recipe != recipe.model_dump(mode="json"):
+        used = self.data_recipe == recipe.model_dump(mode="json") or self._sequences_of_training(recipe) is not None
+        if self.trained.get("rendered") or not used:
             return None
         return split_for(self.recipe.get("split"), recipe)
+
+    def _sequences_of_training(self, recipe: Recipe) -> object:
+        """Return the number of sequences of a recipe in training; None if it is unknown, as in files of earlier versions."""
+        counts = self.trained.get("sequences")
+        return counts.get(recipe.digest()) if isinstance(counts, dict) else None
 
     def learnt(self, samples: SonarPairs | ImpulseSamples) -> NDArray[np.bool_]:
         """Mark the samples ``(samples,)`` of a data set that training may have seen: those whose motions it all used.
@@ -264,15 +273,16 @@ class Checkpoint:
             return np.zeros(len(samples), dtype=bool)
         # 1. First frames of the samples of training: its part of the split, cut to the share of the data that it used.
         fraction, length = self.recipe.get("part_of_data"), self.arrangement["frames"]
-        seen = Part.of(samples.store, "train", split, length)
+        world, sequence, place = _frames_of_training(samples.store, self._sequences_of_training(samples.recipe))
         share = fraction if isinstance(fraction, int | float) else 1.0
-        first = seen.first[seen.first + length <= share * len(samples.store)]
-        used = np.zeros(len(samples.store) + length, dtype=bool)  # motions from each frame to the next
+        first = first_frames(world, sequence, split, "train", length)
+        first = first[first + length <= share * len(sequence)]
+        used = np.zeros(len(sequence) + max(length, samples.frames), dtype=bool)  # motions from each frame to the next
         for step in range(max(length - 1, 1)):
             used[first + step] = True
         # 2. A sample counts as seen if training has seen every motion between its frames.
         steps = range(max(samples.frames - 1, 1))
-        return np.asarray(np.all([used[samples.first + step] for step in steps], axis=0))
+        return np.asarray(np.all([used[place[samples.first] + step] for step in steps], axis=0))
 
     def decode(self, output: Tensor | GaussianHead) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
         """Decode the output of the network.
@@ -316,6 +326,7 @@ class Checkpoint:
             sonars = [
                 f"{received.name}, {received.carrier_hz:g} Hz, {received.bandwidth_hz:g} Hz wide, {received.taps} taps"
             ]
+        trained = {name: value for name, value in self.trained.items() if not isinstance(value, dict)}
         spans = zip(self.labels["names"], self.labels["low"], self.labels["high"], strict=True)
         rows = [
             ("network", f"{self.network}{options}"),
@@ -324,7 +335,7 @@ class Checkpoint:
             ("labels", f"{self.labels['kind']}: " + ", ".join(f"{name} {low:.4g}..{high:.4g}" for name, low, high in spans)),
             ("sonar", "; ".join(dict.fromkeys(sonars)) or "any"),
             ("trained on", f"{self.data}, {self.model} model, noise {self.noise}; {self.fixed}"),
-            ("trained for", ", ".join(f"{name} {_number(value)}" for name, value in self.trained.items()) or "not recorded"),
+            ("trained for", ", ".join(f"{name} {_number(value)}" for name, value in trained.items()) or "not recorded"),
         ]
         for level, scores in self.metrics.items():
             rmse = scores.get("rmse") if isinstance(scores, dict) else None
@@ -400,6 +411,32 @@ class Checkpoint:
         else:
             return cls(**{one.name: table[one.name] for one in fields(cls)})
         raise MitsonarError(f"{source} is damaged: {reason}; train again, or use an intact copy")
+
+
+def _frames_of_training(
+    store: DataStore, sequences: object
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64]]:
+    """Return the frames of a training on a data set of this recipe, of which the store may hold more or fewer sequences.
+
+    Args:
+        store: data set to evaluate on.
+        sequences: number of sequences in training; those of the store if it is unknown.
+
+    Returns:
+        World and sequence of each frame of training ``(n,)``, and the number in training of each frame of the store, n for
+        frames that training did not have.
+    """
+    recipe, scene, sequence = store.recipe, store.read("scene"), store.read("sequence")
+    if type(sequences) is not int or sequences == store.about["sequences"] or recipe.flight.kind != "random":
+        return world_numbers(recipe, store.scenes)[scene], sequence, np.arange(len(scene))
+    # Both begin with the same sequences in each scene.
+    scenes, pings = {one.number: one for one in scenes_of(recipe, sequences)}, recipe.flight.pings
+    place, begin = np.full(len(scene), sequences * pings), 0
+    for number, one in scenes.items():
+        common = np.flatnonzero(scene == number)[: one.sequences * pings]
+        place[common], begin = begin + np.arange(len(common)), begin + one.sequences * pings
+    numbers = np.repeat(list(scenes), [one.sequences * pings for one in scenes.values()])
+    return world_numbers(recipe, scenes)[numbers], np.repeat(np.arange(sequences, dtype=np.int32), pings), place
 
 
 def _numbers_in(options: Fields) -> list[tuple[str, float]]:

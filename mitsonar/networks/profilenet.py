@@ -8,6 +8,7 @@ them over windows of range. A few layers combine those of all portions. The netw
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import torch
@@ -16,9 +17,10 @@ from torch.nn import functional
 
 from mitsonar.datasets.modality import Fields
 from mitsonar.errors import MitsonarError, short_repr
+from mitsonar.instruments.views import SEGMENTS
 from mitsonar.networks.blocks import Network, Size
 
-__all__ = ["ProfileNet"]
+__all__ = ["ProfileNet", "check_portions"]
 
 FAINT = 1e-4
 """Variance below which a level is ignored, relative to the squared mean of all levels."""
@@ -39,6 +41,25 @@ SYMMETRIES: dict[int, list[tuple[tuple[int, ...], tuple[float, float, float]]]] 
     1: [((0,), (1, 1, 1))],
 }
 """Order of the portions in a mirrored world, and the signs of sideways, forward and yaw there, by number of portions."""
+
+SIDEWAYS = {"starboard": "port", "port": "starboard"}
+SIDEWAYS |= {f"{kind}{one}": f"{kind}{other}" for kind in "qc" for one, other in ("14", "41", "23", "32")}
+FORE_AND_AFT = {f"{kind}{one}": f"{kind}{other}" for kind in "qc" for one, other in ("12", "21", "34", "43")}
+"""The portion that shows the same in a mirrored world."""
+
+
+def check_portions(views: Sequence[str]) -> None:
+    """Check that portions of the field of view are in an order of which the symmetries hold.
+
+    Raises:
+        MitsonarError: they are not, so the network would learn wrong signs.
+    """
+    for (order, _), mirrored in zip(SYMMETRIES[len(views)][1:], (SIDEWAYS, FORE_AND_AFT), strict=False):
+        if any(view in SEGMENTS and mirrored.get(view) != views[place] for view, place in zip(views, order, strict=True)):
+            raise MitsonarError(
+                "profilenet takes the whole view, starboard and port, or all quadrants or circular segments clockwise from "
+                f"fore-starboard: got {', '.join(views)}; set input.views to these, or choose posenetvec"
+            )
 
 
 class ProfileNet(Network):

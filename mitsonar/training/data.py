@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import signal
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from mitsonar.config.training import TrainingRecipe
 from mitsonar.datasets.make import calibrate
 from mitsonar.datasets.rendered import RawStream, RenderedPairs
 from mitsonar.datasets.samples import ImpulsePairs, JoinedPairs, SonarPairs
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.io.runs import digest
 from mitsonar.simulation.device import ensure_variant
 
@@ -171,7 +172,8 @@ def material_of(
     share = world.split.train if recipe.split == world.split.by else 1.0
     per_sequence = world.flight.pings - samples.frames + 1
     validation = _rendered_validation(recipe, world, gain) if stored is None else _validation(recipe, stored)
-    about = {"name": world.name, "digest": world.digest("rendered"), "gain": gain}
+    validated_on = [] if stored is None else [len(stored.store)]  # else --resume could exchange the validation samples
+    about = {"name": world.name, "digest": world.digest("rendered", *validated_on), "gain": gain}
     return Material(
         samples, None, max(1, round(world.sequences * share * recipe.part_of_data)) * per_sequence, validation, about
     )
@@ -185,8 +187,37 @@ def _stored(recipe: TrainingRecipe, sets: list[str | Path]) -> Material:
             f"{' and '.join(map(str, sets))}: {len(numbers)} samples for training, fewer than a batch of {recipe.batch}: "
             "make more, or lower batch"
         )
-    validation = _validation(recipe, _joined(recipe, sets, "validation", labels="raw"))
+    unseen = _joined(recipe, sets, "validation", labels="raw")
+    validation = _validation(recipe, unseen)
+    if isinstance(pairs, JoinedPairs) and isinstance(unseen, JoinedPairs):
+        _warn_of_common_samples(_shown_by(pairs, numbers.tolist()), _shown_by(unseen, validation.rows))
     return Material(pairs, numbers, len(numbers), validation, _about(pairs))
+
+
+def _shown_by(pairs: JoinedPairs, numbers: Sequence[int | RawSample]) -> list[tuple[str, int, bytes]]:
+    """Return world, seed and first pose of samples, which are equal if two of them show one motion over one world."""
+    shown = []
+    for part in pairs.parts:
+        recipe, scenes = part.recipe, part.store.scenes
+        worlds = {number: "" if recipe.recorded else repr(recipe.family(one.group)) for number, one in scenes.items()}
+        for first in part.first.tolist():
+            scene = int(part.scene[first])
+            shown.append((worlds[scene], scenes[scene].seed, part.pose[first].tobytes()))
+    return [shown[number] for number in numbers if isinstance(number, int)]
+
+
+def _warn_of_common_samples(training: list[tuple[str, int, bytes]], validation: list[tuple[str, int, bytes]]) -> None:
+    """Warn if data sets of one seed, but of other sizes, put one motion over one world into training and validation."""
+    known = set(training)
+    common = sum(one in known for one in validation)
+    if common:
+        warnings.warn(
+            f"{common} of {len(validation)} validation samples show a motion over a world that training sees in another "
+            "data set, so errors of validation are too small: make one of the data sets with another --seed, or both with "
+            "the same scenes and sequences",
+            MitsonarWarning,
+            stacklevel=4,
+        )
 
 
 def _joined(recipe: TrainingRecipe, sets: list[str | Path], part: str, **options: str) -> Stored:
@@ -205,12 +236,18 @@ def _joined(recipe: TrainingRecipe, sets: list[str | Path], part: str, **options
 
 
 def _about(pairs: Stored) -> JsonObject:
-    """Return name, digest and gain of the data, which must be the same in a resumed run; joined data sets have no gain."""
+    """Return name, digest and gain of the data, which must be the same in a resumed run; joined data sets have no gain.
+
+    ``sequences`` has the number of sequences in each data set, keyed by the digest of its recipe.
+    """
     if not isinstance(pairs, JoinedPairs):
         data_digest, gain = pairs.recipe.digest(len(pairs.store)), pairs.store.about.get("gain")
-        return {"name": pairs.recipe.name, "digest": data_digest, "gain": gain}
+        sequences = {pairs.recipe.digest(): pairs.store.about["sequences"]}
+        return {"name": pairs.recipe.name, "digest": data_digest, "gain": gain, "sequences": sequences}
     digests = [part.recipe.digest(len(part.store)) for part in pairs.parts]
-    return {"name": pairs.described()["data"], "digest": digest(" ".join(digests))[:16], "gain": None}
+    sequences = {part.recipe.digest(): part.store.about["sequences"] for part in pairs.parts}
+    total = digest(" ".join(digests))[:16]
+    return {"name": pairs.described()["data"], "digest": total, "gain": None, "sequences": sequences}
 
 
 def _part(recipe: TrainingRecipe, data: str | Path, part: str, **options: str) -> SonarPairs | ImpulsePairs:

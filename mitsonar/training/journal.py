@@ -242,6 +242,8 @@ class Journal(Callback):
         trained = {"pairs": row["pairs"], "minutes": round(row["minutes"], 2), "epochs": round(row["epoch"], 3)}
         if self.material.numbers is None:
             trained["rendered"] = True
+        else:
+            trained["sequences"] = self.material.about["sequences"]
         return Checkpoint.of(
             self.module.network,
             self.material.samples,

@@ -20,6 +20,7 @@ from mitsonar.motion.errors import AXES, Axis
 from mitsonar.networks.checkpoint import Checkpoint
 from mitsonar.networks.corrnet import GaussianHead, Ground, likelihood
 from mitsonar.networks.create import NETWORKS, called, create_network, options_for
+from mitsonar.networks.profilenet import check_portions
 from mitsonar.training.data import STEP, Array, Batch, Material, Validation, batches, finished, seed_of
 
 if TYPE_CHECKING:
@@ -66,8 +67,10 @@ def network_for(recipe: TrainingRecipe, material: Material) -> nn.Module:
     labels = torch.from_numpy(material.samples.labels.encode(truth))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(recipe.seed)
-        receivers = len(material.samples.described()["arrangement"]["views"])
-        network = create_network(name, **{**options_for(name, inputs, labels, receivers), **options})
+        views = material.samples.described()["arrangement"]["views"]
+        network = create_network(name, **{**options_for(name, inputs, labels, len(views)), **options})
+    if name == "profilenet":
+        check_portions(views)
     if recipe.start is not None:
         _load_weights(network, name, Checkpoint.load(recipe.start))
     _check_shapes(network, name, inputs, labels, material)

@@ -379,10 +379,10 @@ class World:
         The write is atomic: the folder is either complete or absent.
 
         Raises:
-            MitsonarError: the folder is not empty.
+            MitsonarError: the folder is not empty, or is the current one.
         """
         folder = Path(folder)
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and (not folder.name or not folder.is_dir() or any(folder.iterdir())):  # "." has no name
             raise MitsonarError(f"{folder} exists and is kept as it is: choose another -o")
         temporary = folder.with_name(f".{folder.name}.part")  # renamed at the end, so that the folder is complete or absent
         shutil.rmtree(temporary, ignore_errors=True)

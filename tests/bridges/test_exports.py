@@ -144,7 +144,10 @@ def test_yolo_has_a_line_an_object(mitsonar: Command, run: Path, frames: SonarFr
         np.testing.assert_allclose(rows[1, 1:], [5.5 / BEAMS, (8.5 + number) / BINS, 5 / BEAMS, 7 / BINS], atol=1e-6)
     cv2 = pytest.importorskip("cv2")
     assert mitsonar(*words, "-o", tmp_path / "outlines", "--polygons").returncode == 0
-    for line in (tmp_path / "outlines" / "labels" / "train" / "000001.txt").read_text().splitlines()[-2:]:
+    wall, *barrels = (tmp_path / "outlines" / "labels" / "train" / "000001.txt").read_text().splitlines()
+    corners = np.array([(2, 30), (20, 30), (20, 31), (2, 31)]) / (BEAMS, BINS)  # one bin high, which has no outline
+    np.testing.assert_allclose(np.array(wall.split(), float), [0, *corners.ravel()], atol=1e-6)
+    for line in barrels:
         kind, *numbers = line.split()
         points = np.array(numbers, float).reshape(-1, 2) * (BEAMS, BINS) - 0.5
         drawn = cv2.fillPoly(np.zeros((BINS, BEAMS), np.uint8), [points.round().astype(np.int32)], 1)
@@ -316,6 +319,7 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(
     (tmp_path / "there").mkdir()
     words = ("frames", "export", run, "-o")
     refused(mitsonar(*words, tmp_path / "there", "--to", "coco"), "exists and is kept")
+    refused(mitsonar(*words, ".", "--to", "coco"), "exists and is kept")
     refused(mitsonar(*words, tmp_path / "new", "--to", "cocoa"), "unknown layout", "coco")
     refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--picture", "round"), "polar or fan")
     refused(mitsonar(*words, tmp_path / "new", "--to", "coco", "--without", "sandy"), "no shape is named", "sand")
@@ -551,6 +555,14 @@ def test_worlds_of_a_recipe_are_split_by_scene(tmp_path: Path) -> None:
     recipe, rules, _ = detector_recipe(tmp_path / "rocks.yaml", views, "oculus-m750d-1200khz")
     assert (len(recipe.scenes), recipe.sequences, recipe.split.by, recipe.flight.pings) == (6, 60, "scene", 1)
     assert rules == [("seabed", "")]
+
+
+def test_recipes_of_runs_give_random_views_and_those_of_scene_files_the_file(tmp_path: Path) -> None:
+    assert detector_recipe("pattern-runs", DetectorViews(12))[0].flight.kind == "random"
+    world = {"family": "scene", "file": "wreck/scene.xml", "size_m": 20}
+    (tmp_path / "own.yaml").write_text(json.dumps({**TINY, "world": world}))
+    with pytest.raises(MitsonarError, match=r"flies over the scene .*scene\.xml: give that file in place of the recipe"):
+        detector_recipe(tmp_path / "own.yaml", DetectorViews(12))
 
 
 def test_views_of_a_scene_are_clear_of_its_objects_and_drawn_in_pitch(tmp_path: Path, variant: str) -> None:

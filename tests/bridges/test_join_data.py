@@ -15,7 +15,16 @@ from helpers import Command, refused, tiny_recipe
 from numpy.typing import NDArray
 
 from mitsonar import SonarFrames
-from mitsonar.bridges.export_source import FramesWithPoses, Stretch, axes_of, open_export, recorded_recipe, write_recorded
+from mitsonar.acoustics.water import noise_of
+from mitsonar.bridges.export_source import (
+    FramesWithPoses,
+    LabelledPictures,
+    Stretch,
+    axes_of,
+    open_export,
+    recorded_recipe,
+    write_recorded,
+)
 from mitsonar.bridges.join_data import sources_at
 from mitsonar.config.data import Split
 from mitsonar.datasets.make import check, make_dataset
@@ -175,6 +184,28 @@ def test_a_world_stays_in_one_part() -> None:
         assert train[scene == 0].all() == train[scene == 2].all() == train[scene == 0].any()
     assert recipe.split.by == "scene"
     assert recorded_recipe([sources[0], sources[2]], "joined").split.by == "sequence"
+
+
+def test_the_ratio_of_an_object_to_noise_is_that_of_its_own_file(tmp_path: Path) -> None:
+    """Files of another noise and another gain: by those of the first, a barrel would lose its box, or noise get one."""
+    drawn = over_ground(sway(4), SONAR.replace(model="coherent", frequency_hz=1.8e6, noise_level_db=-60.0))
+    shape = np.full(drawn.image.shape, -1, dtype=np.int32)
+    shape[:, 40:60, 30:50] = 0
+    expected = []
+    for name, noise_db, scale, snr_db in (("a", -60.0, 1e-4, 6.0), ("b", -50.0, 1e-4, 4.0), ("c", -60.0, 1e-2, 10.0)):
+        sonar = drawn.sonar.replace(noise_level_db=noise_db)
+        noise = np.broadcast_to(noise_of(sonar)[:, None] / scale, shape.shape)
+        image = (noise * np.where(shape == 0, 1 + 10 ** (snr_db / 10), 1)).astype(np.float32)
+        (tmp_path / name).mkdir()
+        run = replace(drawn, image=image, sonar=sonar, level_scale=scale, shape_id=shape, shape_names=("barrel",))
+        run.save(tmp_path / name / "frames.npz")
+        expected += [{(0, 0): pytest.approx(snr_db, abs=1e-3)}] * len(run)
+    joined(tmp_path / "data.zarr", *(str(tmp_path / name) for name in "abc"))
+    source = open_export(tmp_path / "data.zarr")
+    frames, pictures = source.read(slice(0, source.frames)), LabelledPictures(source.like)
+    assert [pictures.snr_db(frames, k, float(source.raised_db[k])) for k in range(len(frames))] == expected
+    again = sources_at(str(tmp_path / "data.zarr"))
+    assert [source.level_scale for source in again] == [1e-4, 1e-4, 1e-2]
 
 
 def test_a_sequence_of_both_is_refused(made: list[str], tmp_path: Path) -> None:

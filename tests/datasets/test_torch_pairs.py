@@ -191,6 +191,9 @@ def test_frames_for_estimators(made: Path) -> None:
     np.testing.assert_array_equal(frames.poses, pairs.store.read("pose")[pairs.frame_slice(17)])
     np.testing.assert_array_equal(frames.height_m, [2.5, 2.5])
     assert frames.sonar.beams == 12
+    drawn = SonarPairs(made, part="all", noise=["low", "high"], layout="channels")  # each sample draws its level
+    for index in range(0, 120, 12):
+        np.testing.assert_array_equal(drawn.sonar_frames(index).image, drawn[index][0].numpy())
 
 
 # ---------------------------------------------------------------- labels
@@ -400,6 +403,20 @@ def test_rendered_vectors_heights_and_epochs(variant: str) -> None:
     assert len({float(label) for _, label in first}) >= 3
     pairs.set_epoch(1)
     assert not {float(label) for _, label in pairs} & {float(label) for _, label in first}
+
+
+def test_heights_are_those_of_the_sonar_below_its_vehicle(variant: str, tmp_path: Path) -> None:
+    """Of a store and rendered, and the limits too: else quantised labels would be clipped to those of the vehicle."""
+    recipe = tiny_recipe(
+        frames=1, scenes=[{"sequences": 4}], mount__up_m=-0.4, flight__height_m=[2.4, 2.8], flight__pings=1, gain=0.02
+    )
+    make_dataset(recipe, str(tmp_path / "low.zarr"))
+    stored = SonarPairs(tmp_path / "low.zarr", part="all", labels="quantised")
+    assert [stored.labels.low.tolist(), stored.labels.high.tolist()] == [[pytest.approx(2.0)], [pytest.approx(2.4)]]
+    for index in range(4):
+        assert abs(stored.labels.decode(stored[index][1])[0] - stored.target(index)[0]) <= 0.4 / 31 / 2 + 1e-6
+    rendered = [float(label) for _, label in RenderedPairs(recipe, seed=1, length=4, sequences_per_world=4, buffer=1)]
+    assert all(2.0 <= height <= 2.4 for height in rendered)
 
 
 @pytest.mark.thorough

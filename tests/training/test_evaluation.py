@@ -419,6 +419,24 @@ def test_a_comparison_marks_pairs_that_a_network_may_have_learnt_from(mitsonar: 
     assert not rendered.learnt(by_sequence).any()
 
 
+@pytest.mark.parametrize("by", ["sequence", "scene"])
+def test_what_was_learnt_is_known_in_a_shorter_data_set_of_the_recipe(made: Path, tmp_path: Path, by: str) -> None:
+    """Its sequences are in the longer one, but in other parts: their poses tell which of them training has had."""
+    recipe = tiny_recipe(scenes=[{"count": 3, "sequences": 6}], flight={"pings": 2}, **SIZE)
+    make_dataset(recipe, str(tmp_path / "short.zarr"), sequences=10)
+    split = {"by": by, "train": 0.67, "validation": 0.33, "seed": 1}
+    for trained, other, count in ((made, tmp_path / "short.zarr", 18), (tmp_path / "short.zarr", made, 10)):
+        if by == "scene" and count == 10:
+            continue  # a single scene has no parts
+        taught = SonarPairs(trained, part="train", split=split, labels="normx10")
+        about: JsonObject = {"recipe": {"split": split}, "trained": {"sequences": {recipe.digest(): count}}}
+        network, everything = constant(taught, **about), SonarPairs(other, part="all")
+        poses = {taught.pose[first].tobytes() for first in taught.first}
+        expected = [everything.pose[first].tobytes() in poses for first in everything.first]
+        assert network.learnt(everything).tolist() == expected
+        assert 0 < sum(expected) < len(expected) or (by == "scene" and len(everything.store.scenes) == 1)
+
+
 def test_evaluate_prints_the_errors_that_follow(mitsonar: Command, made: Path, run: Path, tmp_path: Path) -> None:
     words = ("evaluate", run, made, "--part", "all", "--noise", "none,high")
     done = mitsonar(*words, "-o", tmp_path / "out")

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,8 @@ from scipy.stats import multivariate_normal
 from typer.testing import CliRunner
 
 from mitsonar.datasets.make import make_dataset
-from mitsonar.errors import MitsonarError
+from mitsonar.datasets.store import DataStore
+from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.io.runs import differences
 
 torch = pytest.importorskip("torch", reason="torch is not installed: install mitsonar[learn]")
@@ -195,6 +197,7 @@ def test_recipes_say_what_they_leave_out(tmp_path: Path) -> None:
         ({"noise": "loud"}, "noise must be none, low, high"),
         ({"noise": []}, "empty list"),
         ({"epochs": 3}, "either epochs or steps"),
+        ({"epochs": np.inf, "steps": None}, "epochs: input should be a finite number"),
         ({"split": "world"}, "split must be sequence, scene"),
         ({"split": {"trian": 0.9}}, "did you mean train"),
         ({"loss": {"kind": "likelihood", "penalty": 1}}, "penalty applies only to kind mse"),
@@ -338,11 +341,44 @@ def test_two_data_sets_are_learnt_from_as_one(made: Path, other: Path) -> None:
     assert joined.about["digest"] != material_of(message, [other, made], render=False).about["digest"]
 
 
+def test_a_motion_in_training_of_one_set_and_validation_of_another_is_told(made: Path, tmp_path: Path) -> None:
+    """Two models of one recipe: a shorter set has the same sequences, but they are divided anew."""
+    for name, sequences in (("short", 14), ("whole", None)):
+        changes = {"name": name, "scenes": [{"count": 2, "sequences": 10}], "sonar__model": "physical", "gain": 0.02}
+        make_dataset(tiny_recipe(**changes), str(tmp_path / name), sequences=sequences)
+    message = recipe(split={"train": 0.5, "validation": 0.5}, validate={"pairs": None, "noise": ["none"]})
+    with pytest.warns(MitsonarWarning, match="validation samples show a motion over a world that training sees") as warned:
+        joined = material_of(message, [made, tmp_path / "short"], render=False)
+    samples, unseen = joined.samples, joined.validation.samples
+    assert isinstance(samples, JoinedPairs)
+    assert isinstance(unseen, JoinedPairs)
+    taught = {part.pose[first].tobytes() for part in samples.parts for first in part.first}
+    common = sum(part.pose[first].tobytes() in taught for part in unseen.parts for first in part.first)
+    assert str(warned[0].message).startswith(f"{common} of {len(unseen)} validation samples")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        material_of(message, [made, tmp_path / "whole"], render=False)
+
+
+def test_rendering_is_not_resumed_with_other_validation_samples(made: Path, tmp_path: Path) -> None:
+    """The best network would be chosen among errors on two sets of samples."""
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(DataStore.open(made).about["recipe"], sort_keys=False))
+    message = recipe(data=str(tmp_path / "tiny.yaml"), validate={"pairs": 2, "noise": ["none"]})
+    about = [material_of(message, data, render=True, gain=0.02).about for data in (made, None)]
+    assert about[0]["name"] == about[1]["name"]
+    assert about[0]["digest"] != about[1]["digest"]
+
+
 def test_a_network_of_two_models_names_both(made: Path, other: Path, tmp_path: Path) -> None:
     stored = train(TrainOptions(recipe(steps=2), [made, other], tmp_path / "run", threads=1, workers=0))
     assert (stored.model, stored.data) == ("thesis and physical", "tiny and other")
     report = evaluate(stored, str(other), part="all", noise=["none"])
     assert not [note for note in report["notes"] if "model" in note]
+    for data, pairs in ((made, 20), (other, 10)):  # also of the second data set
+        taught = SonarPairs(data, split="sequence")
+        seen = len(np.unique(taught.sequence[taught.first]))
+        notes = evaluate(stored, str(data), part="all", noise=["none"])["notes"]
+        assert f"training has seen {seen} of these {pairs} pairs" in notes[0]
     with pytest.raises(MitsonarError, match="begun with data tiny and other, not tiny"):
         train(TrainOptions(recipe(steps=2), made, tmp_path / "run", resume=True, threads=1, workers=0))
 
@@ -545,6 +581,7 @@ def test_a_stop_leaves_a_network_and_a_row_of_the_log(made: Path, tmp_path: Path
     stored = Checkpoint.load(tmp_path / "run")
     (row,) = csv.DictReader((tmp_path / "run" / "log.csv").open())
     assert (stored.trained["steps"], int(row["step"])) == (1, 1)
+    assert stored.trained["sequences"] == {DataStore.open(made).recipe.digest(): 20}
     assert float(row["none sideways (mm)"]) == pytest.approx(stored.metrics["none"]["rmse"][0], rel=1e-4)
     (tmp_path / "run" / "network.ckpt").unlink()
     with pytest.raises(

@@ -66,6 +66,21 @@ def test_a_scaled_mesh_a_colour_and_a_mimic_are_read(tmp_path: Path) -> None:
         imported_world(tmp_path / "crane.urdf", joints={"shoulder": np.nan})
 
 
+def test_a_colour_that_a_link_defines_holds_for_links_that_name_it(tmp_path: Path) -> None:
+    """As in ROS: without a material of the robot, the first visual that gives its colour defines it."""
+    links = "".join(
+        f'<link name="{name}"><visual><geometry><box size="1 1 1"/></geometry><material name="white">{colour}</material>'
+        "</visual></link>"
+        for name, colour in (("a", ""), ("b", '<color rgba="1 1 1 1"/>'), ("c", '<color rgba="0 0 0 1"/>'))
+    )
+    joints = "".join(
+        f'<joint name="{name}" type="fixed"><parent link="a"/><child link="{name}"/></joint>' for name in ("b", "c")
+    )
+    (tmp_path / "white.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    for mesh, reflectivity in zip(imported_world(tmp_path / "white.urdf").meshes, (1, 1, 0), strict=True):
+        assert mesh.reflectivity == pytest.approx(reflectivity)
+
+
 def test_degrees_in_place_of_radians_are_told(tmp_path: Path) -> None:
     box = '<visual><geometry><box size="1 1 1"/></geometry></visual>'
     joint = '<joint name="hinge" type="continuous"><parent link="a"/><child link="b"/><origin rpy="0 90 0"/></joint>'
@@ -152,6 +167,22 @@ def test_frames_models_and_includes_are_placed_in_closed_form(tmp_path: Path) ->
     np.testing.assert_allclose(middle_of(opened, "pier::door"), (9.5, 4, 0), atol=1e-9)
     scoped = imported_world(tmp_path / "harbour.sdf", joints={"pier::hinge": np.pi / 2})
     np.testing.assert_array_equal(middle_of(scoped, "pier::door"), middle_of(opened, "pier::door"))
+
+
+def test_a_joint_to_a_link_of_a_nested_model_moves_that_model(tmp_path: Path) -> None:
+    """A quarter turn about the base, 2 m away, of the arm and of what it carries."""
+    shape = '<visual name="v"><geometry><box><size>1 1 1</size></box></geometry></visual>'
+    hand = f'<model name="hand"><pose>1 0 0 0 0 0</pose><link name="palm">{shape}</link></model>'
+    (tmp_path / "rov.sdf").write_text(
+        f'<sdf version="1.9"><model name="rov"><link name="base">{shape}</link>'
+        f'<model name="arm"><pose>2 0 0 0 0 0</pose><link name="bar">{shape}</link>{hand}</model>'
+        '<joint name="elbow" type="revolute"><pose relative_to="base"/><parent>base</parent><child>arm::bar</child>'
+        "<axis><xyz>0 0 1</xyz></axis></joint></model></sdf>"
+    )
+    for angle, bar, palm in ((0.0, (2, 0, 0), (3, 0, 0)), (np.pi / 2, (0, 2, 0), (0, 3, 0))):
+        world = imported_world(tmp_path / "rov.sdf", joints={"elbow": angle})
+        np.testing.assert_allclose(middle_of(world, "rov::arm::bar"), bar, atol=1e-9)
+        np.testing.assert_allclose(middle_of(world, "rov::arm::hand::palm"), palm, atol=1e-9)
 
 
 def test_what_a_harbour_cannot_hold_is_left_out_with_a_warning(tmp_path: Path) -> None:

@@ -108,6 +108,13 @@ def test_a_folder_that_holds_something_is_kept(tmp_path: Path) -> None:
     assert files_of(tmp_path) == {"mine": b"years of work"}
 
 
+def test_the_current_folder_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even an empty one: a shell cannot stay in a folder that is replaced."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(MitsonarError, match="kept as it is"):
+        RockyField(size_m=3, a_side=(2, 2)).build(0).write(".")
+
+
 # ---------------------------------------------------------------- rocky field
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import pickle
 from dataclasses import replace
@@ -38,8 +39,11 @@ from mitsonar.estimation.named import create_estimator  # noqa: E402
 from mitsonar.mapping.open_source import open_views  # noqa: E402
 from mitsonar.networks.checkpoint import Checkpoint  # noqa: E402
 from mitsonar.networks.create import create_network, options_for  # noqa: E402
+from mitsonar.networks.profilenet import check_portions  # noqa: E402
+from mitsonar.training.data import material_of  # noqa: E402
 from mitsonar.training.evaluate import evaluate, predictions  # noqa: E402
 from mitsonar.training.run import train  # noqa: E402
+from mitsonar.training.step import network_for  # noqa: E402
 
 GAINS = {"coherent": 268.0, "physical": 343.0}
 """Of the sets that the shipped ProfileNet has learnt from."""
@@ -240,6 +244,31 @@ def test_a_profile_net_learns_shifts_of_a_part_of_a_level() -> None:
 def test_profile_nets_that_cannot_be_are_refused(options: dict[str, Any], said: str) -> None:
     with pytest.raises(MitsonarError, match=said):
         create_network("profilenet", **{"size": [64, 8], **options})
+
+
+@pytest.mark.parametrize(
+    ("views", "fits"),
+    [
+        (["c1", "c2", "c3", "c4"], True),
+        (["q4", "q3", "q2", "q1"], True),  # counterclockwise has the same mirror images
+        (["q1", "q4"], True),
+        (["q1", "q3"], False),  # one is the other turned, not mirrored
+        (["q1", "q4", "q2", "q3"], False),
+        (["c4", "c1", "c2", "c3"], False),
+    ],
+)
+def test_a_profile_net_is_trained_on_portions_whose_symmetries_it_has(portions: Path, views: list[str], fits: bool) -> None:
+    """Exchanged portions turn the signs of sideways and yaw by construction, which must be those of their mirror image."""
+    expectation = contextlib.nullcontext() if fits else pytest.raises(MitsonarError, match="clockwise from fore-starboard")
+    with expectation:
+        check_portions(views)
+    if views[0].startswith("c"):
+        keys = {"kind": "vector", "views": views}
+        network = {"name": "profilenet", "windows": 4, "width": 0.2}
+        recipe = training_recipe_from({"network": network, "steps": 1, "batch": 2, "input": keys})
+        material = material_of(recipe, portions, render=False)
+        with expectation:
+            network_for(recipe, material)
 
 
 def test_the_schedule_of_the_chapter() -> None:
