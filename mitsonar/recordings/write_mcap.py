@@ -532,11 +532,13 @@ class FrameEncoder(_RosEncoder):
     def _scan(self, frames: SonarFrames, index: int, time: int, returns: BeamReturns) -> RosObject:
         """Return the first returns as a laser scan: angles are positive to port, and rays follow in order of time.
 
-        The header has the time of the first ray. Rays of beams that ping at once run from starboard to port. The range of a
-        ray without a return is infinite (REP 117).
+        The header has the time of the first ray. Rays of beams that ping at once, or in interleaved groups, run from
+        starboard to port at one time. The range of a ray without a return is infinite (REP 117).
         """
         bearing, ranges, value = frames.bearing_rad, returns.range_m[index], returns.value[index]
         times, sonar = beam_times(frames, index), frames.sonar
+        if times is not None and (np.diff(times) > 0).any() and (np.diff(times) < 0).any():
+            times = None
         from_starboard = times is None or times[0] > times[-1]
         order = slice(None, None, -1) if from_starboard else slice(None)
         angle = -bearing[order]
