@@ -284,6 +284,9 @@ PICTURES = {"png": ("PNG", {"compress_level": 3}), "jpeg": ("JPEG", {"quality": 
 UINT8, FLOAT32 = 0, 8
 """Codes of sample types in ``SonarImageData``."""
 
+UNKNOWN_VARIANCE = 1e6
+"""Variance of a heading that is not known [rad^2]."""
+
 EVEN_RTOL = 1e-3
 """Relative tolerance for equal steps between beams, which a laser scan requires."""
 
@@ -586,16 +589,19 @@ class FrameEncoder(_RosEncoder):
         )
 
     def _imu(self, attitude: Array, time: int) -> RosObject:
-        """Return pitch, roll, heading ``(3,)`` [rad] as the orientation of an IMU; a covariance of -1 marks unknowns."""
-        known = bool(np.isfinite(attitude).all())
+        """Return pitch, roll, heading ``(3,)`` [rad] as the orientation of an IMU; a covariance of -1 marks unknowns.
+
+        If the heading alone is unknown, it is 0 with a variance that no angle has.
+        """
+        known = bool(np.isfinite(attitude[:2]).all())
         _, turn = _ros_pose(np.concatenate([np.zeros(3), np.where(np.isfinite(attitude), attitude, 0)]))
-        unknown = np.zeros(9)
-        unknown[0] = -1
+        unknown, covariance = np.zeros(9), np.zeros(9)
+        unknown[0], covariance[8] = -1, 0 if np.isfinite(attitude[2]) else UNKNOWN_VARIANCE
         return self._make(
             "sensor_msgs/Imu",
             header=self._header(time, BODY),
             orientation=self._vector(turn.as_quat(canonical=True), "geometry_msgs/Quaternion"),
-            orientation_covariance=np.zeros(9) if known else unknown,
+            orientation_covariance=covariance if known else unknown,
             angular_velocity=self._vector(np.zeros(3)),
             angular_velocity_covariance=unknown,
             linear_acceleration=self._vector(np.zeros(3)),
