@@ -414,6 +414,10 @@ class SonarFrames:
                 f"image must be (frames, bins, beams) = ({len(self.time_s)}, {len(self.range_m)}, "
                 f"{len(self.bearing_rad)}) after time_s, range_m and bearing_rad: got {self.image.shape}"
             )
+        if self.image.dtype.kind == "u" and self.image.dtype != np.uint8:
+            raise MitsonarError(
+                f"image must be uint8 in 0..255, or floats in 0..1: got {self.image.dtype}; divide it by its largest value"
+            )
         if self.level not in LEVELS:
             raise MitsonarError(f"level must be one of {', '.join(LEVELS)}: got {short_repr(self.level)}")
         for name in PER_FRAME:

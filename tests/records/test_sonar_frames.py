@@ -112,6 +112,7 @@ def test_pitch_is_known_where_poses_are() -> None:
         ),
         ({"image": np.zeros((10, 6), np.float32)}, r"image must be .* got \(10, 6\)"),
         ({"time_s": np.zeros(3)}, r"image must be .*\(3, 10, 6\) after time_s"),
+        ({"image": np.ones(SHAPE, np.uint16)}, r"uint8 in 0\.\.255, or floats in 0\.\.1: got uint16"),
         ({"level": "log"}, "level must be one of linear, dB, gamma, contrast: got 'log'"),
         ({"poses": np.zeros((3, 6))}, "poses must hold 4 frames: got 3"),
         ({"height_m": np.zeros(5)}, "height_m must hold 4 frames: got 5"),
