@@ -29,6 +29,7 @@ from mitsonar.io.files import (
     read_json,
     read_npz,
     refuse_beyond_memory,
+    whole_file,
     whole_number,
 )
 
@@ -558,9 +559,10 @@ class SonarFrames:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write ``frames.npz``."""
-        table: dict[str, Any] = self.arrays()
-        np.savez_compressed(Path(path), **table)
+        """Write ``frames.npz``; the file is complete, or what was there before. Names without a suffix get ``.npz``."""
+        path, table = Path(path), dict[str, Any](self.arrays())
+        with whole_file(path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")) as file:
+            np.savez_compressed(file, **table)
 
     @classmethod
     def load(cls, path: str | Path) -> SonarFrames:

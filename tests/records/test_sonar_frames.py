@@ -66,6 +66,22 @@ def test_npz_round_trip(tmp_path: Path, changed: dict[str, Any]) -> None:
     assert_same(SonarFrames.load(tmp_path), expected)  # the folder of a run
 
 
+def test_a_disk_that_is_full_leaves_the_frames_of_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "frames.npz"
+    frames().save(path)
+
+    def full(file: Any, **table: Any) -> None:
+        with file if hasattr(file, "write") else Path(file).open("wb") as opened:
+            opened.write(b"PK")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(OSError, match="No space"):
+        frames(poses=None).save(path)
+    assert_same(SonarFrames.load(path), frames())
+    assert [one.name for one in tmp_path.iterdir()] == ["frames.npz"]
+
+
 def test_zarr_group_reads_like_npz(tmp_path: Path) -> None:
     import zarr
 
