@@ -683,6 +683,11 @@ class Sonar(Instrument):
             )
 
     def _check_aperture(self) -> None:
+        if self.azimuth_fov_deg > 180 and not scans(self):
+            raise ValueError(
+                "an array does not distinguish ahead from astern, so that its pattern covers at most 180 deg: got "
+                f"azimuth_fov_deg {self.azimuth_fov_deg:g}; use pattern box, or ping_groups {self.beams} for a rotating head"
+            )
         length = self.aperture.length
         if length < LEAST_APERTURE:
             widest = math.degrees(length * self.beam_width_rad / LEAST_APERTURE)

@@ -529,7 +529,7 @@ def read_neusis(path: Path) -> Recording:
         poses=poses_from(poses[:, :3, 3], rotation * FORWARD_PORT_UP),
     )
     facts: Facts = {"views": len(files), "largest_value": largest}
-    notes = ["views have no times: they are ordered by name, at an assumed {RATE_HZ:g} Hz"]
+    notes = [f"views have no times: they are ordered by name, at an assumed {RATE_HZ:g} Hz"]
     if largest > 1:
         notes.append(f"values reach {largest:.4g}: they are divided by it")
     return Recording(str(path), "views (neusis)", (part,), facts, tuple(notes))

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.errors import MitsonarError, argument, count_noun
 from mitsonar.instruments.beams import Pattern
-from mitsonar.instruments.sonar import scans
+from mitsonar.instruments.sonar import Sonar, group_of_beams, ping_interval_s, scans
 from mitsonar.records.frames import SonarFrames
 
 __all__ = [
@@ -106,7 +106,8 @@ class Part:
             beams: first beam and the beam after the last one; None keeps all beams.
 
         Raises:
-            MitsonarError: if an interval holds fewer than two bins or beams, or exceeds those of the part.
+            MitsonarError: if an interval holds fewer than two bins or beams, or exceeds those of the part; or if no
+                order of ping groups describes the beams that are left.
         """
         rows, columns = (
             _crop_slice(what, span, len(axis))
@@ -114,10 +115,9 @@ class Part:
         )
         range_m, bearing_rad = self.like.range_m[rows], self.like.bearing_rad[columns]
         step_m, step_rad = (float(np.diff(axis).mean()) for axis in (range_m, bearing_rad))
-        scanning = scans(self.like.sonar)
         sonar = self.like.sonar.replace(
             beams=len(bearing_rad),
-            ping_groups=len(bearing_rad) if scanning else min(self.like.sonar.ping_groups, len(bearing_rad)),
+            **_groups_of(self.like.sonar, columns),
             range_bins=len(range_m),
             range_min=max(0.0, float(range_m[0] - step_m / 2)),
             range_max=float(range_m[-1] + step_m / 2),
@@ -140,6 +140,27 @@ class Part:
         count = max(1, CHUNK_BYTES // (4 * cells))
         for start in range(0, len(self), count):
             yield self.read(np.arange(start, min(start + count, len(self))))
+
+
+def _groups_of(sonar: Sonar, columns: slice) -> dict[str, Any]:
+    """Return the ping groups of some of the beams of a sonar, with the times that they have in the whole fan.
+
+    Raises:
+        MitsonarError: if no order of groups describes those beams.
+    """
+    if sonar.ping_groups == 1:
+        return {}
+    group = group_of_beams(sonar)[columns]
+    group = group - group.min()
+    groups: dict[str, Any] = {"ping_groups": int(group.max()) + 1, "group_interval_s": ping_interval_s(sonar)}
+    cropped = sonar.replace(beams=len(group), **groups)
+    if not scans(sonar) and (group_of_beams(cropped) != group).any():
+        together = sonar.beams // sonar.ping_groups if sonar.group_order == "sequential" else sonar.ping_groups
+        raise MitsonarError(
+            f"{argument('crop_beams')} must not change which of the {sonar.ping_groups} ping groups ({sonar.group_order}) a "
+            f"beam is in: got {columns.start},{columns.stop} of {sonar.beams} beams; give multiples of {together}"
+        )
+    return groups
 
 
 def _crop_slice(what: str, span: tuple[int, int] | None, count: int) -> slice:

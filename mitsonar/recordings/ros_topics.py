@@ -47,6 +47,9 @@ MAX_COORDINATE_M = 1e8
 NORM_TOLERANCE = 0.1
 """Tolerated deviation of the norm of a quaternion from 1."""
 
+UNKNOWN_HEADING_RAD2 = (2 * math.pi) ** 2
+"""Variance of an IMU's turn about the vertical from which the heading counts as unknown [rad^2]."""
+
 MAX_GAP_S = 2.0
 """Longest time between two poses over which poses are interpolated [s]."""
 
@@ -175,22 +178,28 @@ class _MotionSources:
         """Return pitch, roll and heading of the sonar ``(frames, 3)`` [rad] measured by the only IMU; None without one.
 
         Fixed transforms must connect the sonar's frame with that of the IMU. Its orientation is relative to east, north, up
-        (REP 145).
+        (REP 145). A heading whose variance exceeds :data:`UNKNOWN_HEADING_RAD2` is nan.
         """
         imus = [one for one in self.topics if one.kind == IMU]
         if len(imus) != 1:
             return None
-        child, link = "", Link("", imus[0].name)
+        child, link, unknown = "", Link("", imus[0].name), array("d")
         for _, raw in self.bag.messages(imus[0].name):
             message = self.bag.decode(raw, IMU)
             child = _frame_name(message.header.frame_id)
             if float(message.orientation_covariance[0]) != -1:
                 link.numbers.extend((_seconds(message), 0.0, 0.0, 0.0, *_numbers(message.orientation)))
+                unknown.extend((_seconds(message), float(message.orientation_covariance[8] > UNKNOWN_HEADING_RAD2)))
         mount = _fixed_links(self.links, self.frame, child)
         if mount is None:
             return None
         poses = _compose([*mount, link], self.axes, self.time_s, link.topic).poses
-        return None if poses is None else poses[:, 3:]
+        if poses is None:
+            return None
+        table = np.array(unknown).reshape(-1, 2)
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        poses[np.interp(self.time_s, *table.T) > 0, 5] = np.nan
+        return poses[:, 3:]
 
     def heights(self) -> Array | None:
         """Return heights above the ground ``(frames,)`` [m] by the only altimeter; nan where unknown, None without one.

@@ -342,8 +342,8 @@ def empty_aris_frames(headers: Header, samples: int, beams: int) -> SonarFrames:
         elevation_fov_deg=TELEPHOTO_ELEVATION_DEG if lens else kind.elevation_deg,
         elevation_pattern=ELEVATION_PATTERN,
         beams=beams,
-        range_min=near,
-        range_max=near + samples * step,
+        range_min=max(0.0, near - step / 2),  # ranges are centres of bins
+        range_max=near + (samples - 0.5) * step,
         range_bins=samples,
         sound_speed=speed,
         bearing="cone",

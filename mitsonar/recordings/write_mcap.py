@@ -284,6 +284,9 @@ PICTURES = {"png": ("PNG", {"compress_level": 3}), "jpeg": ("JPEG", {"quality": 
 UINT8, FLOAT32 = 0, 8
 """Codes of sample types in ``SonarImageData``."""
 
+UNKNOWN_VARIANCE = 1e6
+"""Variance of a heading that is not known [rad^2]."""
+
 EVEN_RTOL = 1e-3
 """Relative tolerance for equal steps between beams, which a laser scan requires."""
 
@@ -532,11 +535,13 @@ class FrameEncoder(_RosEncoder):
     def _scan(self, frames: SonarFrames, index: int, time: int, returns: BeamReturns) -> RosObject:
         """Return the first returns as a laser scan: angles are positive to port, and rays follow in order of time.
 
-        The header has the time of the first ray. Rays of beams that ping at once run from starboard to port. The range of a
-        ray without a return is infinite (REP 117).
+        The header has the time of the first ray. Rays of beams that ping at once, or in interleaved groups, run from
+        starboard to port at one time. The range of a ray without a return is infinite (REP 117).
         """
         bearing, ranges, value = frames.bearing_rad, returns.range_m[index], returns.value[index]
         times, sonar = beam_times(frames, index), frames.sonar
+        if times is not None and (np.diff(times) > 0).any() and (np.diff(times) < 0).any():
+            times = None
         from_starboard = times is None or times[0] > times[-1]
         order = slice(None, None, -1) if from_starboard else slice(None)
         angle = -bearing[order]
@@ -584,16 +589,19 @@ class FrameEncoder(_RosEncoder):
         )
 
     def _imu(self, attitude: Array, time: int) -> RosObject:
-        """Return pitch, roll, heading ``(3,)`` [rad] as the orientation of an IMU; a covariance of -1 marks unknowns."""
-        known = bool(np.isfinite(attitude).all())
+        """Return pitch, roll, heading ``(3,)`` [rad] as the orientation of an IMU; a covariance of -1 marks unknowns.
+
+        If the heading alone is unknown, it is 0 with a variance that no angle has.
+        """
+        known = bool(np.isfinite(attitude[:2]).all())
         _, turn = _ros_pose(np.concatenate([np.zeros(3), np.where(np.isfinite(attitude), attitude, 0)]))
-        unknown = np.zeros(9)
-        unknown[0] = -1
+        unknown, covariance = np.zeros(9), np.zeros(9)
+        unknown[0], covariance[8] = -1, 0 if np.isfinite(attitude[2]) else UNKNOWN_VARIANCE
         return self._make(
             "sensor_msgs/Imu",
             header=self._header(time, BODY),
             orientation=self._vector(turn.as_quat(canonical=True), "geometry_msgs/Quaternion"),
-            orientation_covariance=np.zeros(9) if known else unknown,
+            orientation_covariance=covariance if known else unknown,
             angular_velocity=self._vector(np.zeros(3)),
             angular_velocity_covariance=unknown,
             linear_acceleration=self._vector(np.zeros(3)),

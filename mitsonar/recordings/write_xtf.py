@@ -72,6 +72,9 @@ PORT, STARBOARD = 1, 2
 METRES, DEGREES = 0, 3
 """Units of positions."""
 
+END_S = 7_258_118_400.0
+"""Begin of the year 2200 [s since 1970], before which times must lie."""
+
 KNOTS = 3600 / 1852
 PAD = 64
 """The size of a record is a multiple of this [bytes]."""
@@ -85,11 +88,17 @@ def write_xtf(path: str | Path, echogram: Echogram) -> None:
     north. Heights above the ground are those of the echogram. Times count from 1970.
 
     Raises:
-        MitsonarError: if the echogram is not that of a side-scan sonar.
+        MitsonarError: if the echogram is not that of a side-scan sonar, or the format has no dates for its times.
     """
     sounder = echogram.sounder
     if sounder.kind != "sidescan":
         raise MitsonarError(f"XTF files hold side-scans: got the echogram of a {sounder.kind}; save it as .npz")
+    first, last = float(echogram.time_s.min()), float(echogram.time_s.max())
+    if not 0 <= first <= last < END_S:
+        raise MitsonarError(
+            f"times of an XTF file are seconds since 1970, to the year 2200: got {first:.10g} to {last:.10g} s; give the "
+            "path other times"
+        )
     largest = float(np.sqrt(echogram.levels.max())) or 1.0
     counts = np.rint(np.sqrt(echogram.levels) * (FULL_COUNT / largest)).astype("<i2")
     sides = [counts[:, sounder.channels.index("port"), ::-1], counts[:, sounder.channels.index("starboard")]]

@@ -394,8 +394,8 @@ def _band(
     weight[np.abs(weight) > MOST_WEIGHT] = 0
     slant, delay, duration = (_floats(table, name) for name in ("slant_range_m", "delay_s", "duration_s"))
     duration = np.where((duration > 0) & (duration < 1e3), duration, np.nan)
-    far = np.where((slant > 0) & (slant <= 1e5), slant, np.nan_to_num(duration * sound_speed / 2))
     near = np.where((delay > 0) & (delay < 1e3), delay, 0) * sound_speed / 2
+    far = np.where((slant > 0) & (slant <= 1e5), slant, np.nan_to_num(near + duration * sound_speed / 2))
     near = np.where(near < far, near, 0.0)
     stated = np.where(table["frequency_khz"] > 0, table["frequency_khz"], channels[pair[0]].frequency).astype(float)
     along, across, tilt = channels[pair[0]].angles_deg

@@ -29,6 +29,7 @@ from mitsonar.io.files import (
     read_json,
     read_npz,
     refuse_beyond_memory,
+    whole_file,
     whole_number,
 )
 
@@ -414,6 +415,10 @@ class SonarFrames:
                 f"image must be (frames, bins, beams) = ({len(self.time_s)}, {len(self.range_m)}, "
                 f"{len(self.bearing_rad)}) after time_s, range_m and bearing_rad: got {self.image.shape}"
             )
+        if self.image.dtype.kind == "u" and self.image.dtype != np.uint8:
+            raise MitsonarError(
+                f"image must be uint8 in 0..255, or floats in 0..1: got {self.image.dtype}; divide it by its largest value"
+            )
         if self.level not in LEVELS:
             raise MitsonarError(f"level must be one of {', '.join(LEVELS)}: got {short_repr(self.level)}")
         for name in PER_FRAME:
@@ -554,9 +559,10 @@ class SonarFrames:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write ``frames.npz``."""
-        table: dict[str, Any] = self.arrays()
-        np.savez_compressed(Path(path), **table)
+        """Write ``frames.npz``; the file is complete, or what was there before. Names without a suffix get ``.npz``."""
+        path, table = Path(path), dict[str, Any](self.arrays())
+        with whole_file(path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")) as file:
+            np.savez_compressed(file, **table)
 
     @classmethod
     def load(cls, path: str | Path) -> SonarFrames:

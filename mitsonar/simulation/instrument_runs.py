@@ -487,7 +487,10 @@ def _write_soundings(folder: Path, soundings: Soundings, parts: Mapping[str, NDA
         echogram = Echogram(soundings.time_s, soundings.poses, soundings.sounder, levels, height_m)
         echogram.save(folder / "echogram.npz")
         if kind == "sidescan":
-            write_xtf(folder / "sidescan.xtf", echogram)
+            try:
+                write_xtf(folder / "sidescan.xtf", echogram)
+            except MitsonarError as error:  # the other files are whole
+                notes.append(f"there is no sidescan.xtf: {error}")
             figures.save_sounding_figure(figures.side_scan_figure(echogram), folder / "waterfall.png")
         else:
             figures.save_sounding_figure(figures.echogram_figure(echogram, soundings), folder / "echogram.png")

@@ -341,8 +341,8 @@ class StoredEchoes:
         self.traced = frames.sonar
         change: dict[str, Any] = {} if bins is None else {"range_bins": bins}
         change |= {} if window is None else {"range_min": window[0], "range_max": window[1]}
-        if frames.sonar.model == "coherent":  # echoes have no phase: only expected levels in hard boxes can be binned
-            change |= {"model": "physical", "pattern": "box"}
+        if frames.sonar.beam_pattern != "box":  # echoes have neither phase nor losses: expected levels in hard boxes
+            change |= {"model": "physical", "pattern": "box", "absorption_db_per_m": None}
         self.sonar = frames.sonar.replace(**change, bounces=1)  # stored echoes have one reflection
         self.notes: list[str] = []
 

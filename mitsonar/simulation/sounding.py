@@ -124,10 +124,11 @@ class SounderSimulator:
         return Soundings(flown.time_s, flown.poses, self.sounder, *joined)
 
     def _noise(self) -> NDArray[np.float64]:
-        """Return the mean level of noise and volume after the gain ``(bins,)``; 0 if there is none."""
+        """Return the mean level of noise, volume and the detector's offset after the gain ``(bins,)``; 0 without them."""
         fan, imager = self.sounder.fan, self.simulator.model.imager
         if imager is not None:
-            return np.asarray(sum(imager.receiver.noise_powers()) * imager.gain, dtype=np.float64)
+            power = sum(imager.receiver.noise_powers()) + imager.receiver.offset.mean()
+            return np.asarray(power * imager.gain, dtype=np.float64)
         if fan.noise_level_db is None:
             return np.zeros(fan.range_bins)
         return np.asarray(10 ** ((fan.noise_level_db - fan.source_level_db) / 10) * gain_of(fan), dtype=np.float64)

@@ -266,6 +266,21 @@ def test_a_long_run_stays_zarr(scene: Path, tmp_path: Path, monkeypatch: pytest.
     np.testing.assert_array_equal(SonarFrames.load(tmp_path / "zarr").image, SonarFrames.load(tmp_path / "npz").image)
 
 
+def test_stored_echoes_have_no_pattern(scene: Path, tmp_path: Path) -> None:
+    """Echoes of rays are those ahead of pattern and absorption, and frames of them state so."""
+    loaded = load_scene(scene)
+    placed = sonar_in(loaded)
+    assert placed is not None
+    sonar = placed[0].replace(pattern="two_way", absorption_db_per_m=1.0)
+    path = Trajectory(np.array([placed[1]]), np.zeros(1))
+    run(Simulator(loaded, sonar), path, RenderOptions(NOISE_MODELS["none"], exr=True), Destination(tmp_path / "out"))
+    source = StoredEchoes(tmp_path / "out")
+    (pings,) = source.pings(path.poses)
+    (boxes,) = Simulator(loaded, placed[0]).pings(path.poses)
+    np.testing.assert_array_equal(pings.levels, boxes.levels)
+    assert (source.sonar.beam_pattern, source.sonar.absorption_db_per_m) == ("box", None)
+
+
 def test_broken_echoes_are_named(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert mitsonar("render", scene, "-o", out, "--exr").returncode == 0

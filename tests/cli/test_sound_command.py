@@ -39,6 +39,17 @@ def test_each_instrument_writes_what_it_promises(mitsonar: Command, tmp_path: Pa
         assert load_sensors(out / "sensors.csv").forward is not None
 
 
+def test_a_path_before_1970_has_all_files_but_the_xtf(mitsonar: Command, tmp_path: Path) -> None:
+    level = np.array([[0, 0, 2.0, 0, 0, 0], [0, 0.5, 2.0, 0, 0, 0]])
+    Trajectory(level, np.array([-2.0, -1.5])).save(tmp_path / "path.tum")
+    arguments = ("--trajectory", tmp_path / "path.tum", "--quality", "draft", "--model", "physical", "-o", tmp_path / "out")
+    done = mitsonar("sound", "flat_floor", "--instrument", "sidescan", *arguments)
+    assert done.returncode == 0, done.stderr
+    assert "there is no sidescan.xtf: times of an XTF file are seconds since 1970" in " ".join(done.stderr.split())
+    written = {one.name for one in (tmp_path / "out").iterdir()}
+    assert written == FILES["sidescan"] - {"sidescan.xtf"} | {"run.json", "run.yaml"}
+
+
 def test_a_finished_run_is_kept(mitsonar: Command, tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = ("sound", "flat_floor", "--instrument", "altimeter", *PATH, "-o", out)

@@ -144,6 +144,7 @@ def test_jitter_can_be_forced(model: str, jitter: bool) -> None:
         ({"seed": -1}, r"seed: .*got -1"),
         ({"bearing": "cone", "azimuth_fov_deg": 200}, r"cone bearing covers at most 180 deg: got azimuth_fov_deg 200"),
         ({"beam_layout": "sine", "azimuth_fov_deg": 200}, r"beam_layout sine covers at most 180 deg"),
+        ({"pattern": "two_way", "azimuth_fov_deg": 200}, r"pattern covers at most 180 deg: got azimuth_fov_deg 200"),
         ({"beams": 60_000, "rays_per_beam": 900_000, "rays_across": 4}, r"at most 268,435,456 rays: got 216,000,000,000"),
     ],
 )

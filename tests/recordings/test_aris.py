@@ -33,7 +33,7 @@ def test_the_sample_is_what_its_readme_says() -> None:
     assert frames.sonar.sound_speed == pytest.approx(1435.93, abs=0.01)
     assert frames.range_m[0] == pytest.approx(3.298, abs=5e-4)
     assert np.diff(frames.range_m) == pytest.approx(0.01005, abs=2e-6)
-    assert frames.sonar.range_max == pytest.approx(23.401, abs=5e-4)
+    assert frames.sonar.range_max == pytest.approx(23.396, abs=5e-4)
     assert np.degrees(frames.bearing_rad[[0, -1]]) == pytest.approx([-7.34, 7.34], abs=0.07)
     assert (np.diff(frames.bearing_rad) > 0).all()
     assert np.diff(frames.time_s).min() > 0.1524
@@ -88,6 +88,11 @@ def written(path: Path, **changed: ArrayLike) -> Path:
     """Write an ARIS 3000 of 5 frames; fields of the headers may be changed ``(frames,)``."""
     path.write_bytes(aris_file(frames=5, samples=40, **changed))
     return path
+
+
+def test_bins_of_the_sonar_lie_at_the_ranges_of_the_frames(tmp_path: Path) -> None:
+    frames = open_recording(written(tmp_path / "a.aris")).part().read([0])
+    assert frames.sonar.range_m == pytest.approx(frames.range_m, abs=1e-9)
 
 
 def test_frames_are_sorted_repeated_ones_dropped_and_missing_ones_counted(tmp_path: Path) -> None:

@@ -225,6 +225,19 @@ def test_beams_of_one_ping_run_from_starboard_and_uneven_ones_are_no_scan(tmp_pa
     assert not {"/sonar/scan", "/sonar/returns"} & set(by_rosbags(tmp_path / "c.mcap"))
 
 
+def test_beams_of_interleaved_groups_have_one_time(tmp_path: Path) -> None:
+    """A scan can state that its rays follow one another, but not that each fourth beam pings at once."""
+    sonar = Sonar(beams=8, ping_groups=4, range_bins=5, range_min=1.0, range_max=1.5)
+    image = np.ones((1, 5, 8), np.float32)
+    time_s, _ = timed_path(sonar, Trajectory(np.zeros((1, 6)), np.array([7.0]))).of_beams(sonar)
+    frames = SonarFrames(image, sonar.range_m, sonar.bearing_rad, time_s, sonar)
+    with pytest.warns(MitsonarWarning, match="where the search begins"):
+        write_mcap([frames], tmp_path / "a.mcap", returns=FirstReturns(-5.0))
+    scan = by_rosbags(tmp_path / "a.mcap")["/sonar/scan"][0]
+    assert (scan.time_increment, seconds(scan)) == (0, 7)
+    assert scan.angle_min == pytest.approx(-sonar.bearing_rad[-1], abs=1e-6)
+
+
 def test_levels_that_find_nothing_or_ringing_are_noted(tmp_path: Path) -> None:
     sonar = Sonar(beams=4, range_bins=5, range_min=1.0, range_max=1.5)
     image = np.zeros((1, 5, 4), np.float32)

@@ -11,6 +11,7 @@ import pytest
 from drawn_frames import over_ground, sway
 
 from mitsonar import MitsonarError, SonarFrames
+from mitsonar.instruments.sonar import Sonar, group_of_beams, ping_offsets_s
 from mitsonar.mapping.sources import load_frames
 from mitsonar.recordings import pictures
 from mitsonar.recordings.pictures import write_frames
@@ -102,3 +103,21 @@ def test_another_recording_is_not_resumed_and_other_things_are_kept(frames: Sona
     (tmp_path / "other/notes.txt").write_text("mine")
     with pytest.raises(MitsonarError, match="contains other files"):
         write_frames(of(frames), None, tmp_path / "other")
+
+
+def beam_times(sonar: Sonar) -> np.ndarray:
+    return ping_offsets_s(sonar)[group_of_beams(sonar)]
+
+
+@pytest.mark.parametrize("order", ["interleaved", "interleaved_starboard", "sequential"])
+@pytest.mark.parametrize("beams", [(24, 72), (48, 96), (0, 96)])
+def test_a_crop_keeps_the_times_of_ping_groups(order: str, beams: tuple[int, int]) -> None:
+    sonar = Sonar.create(beams=96, ping_groups=8, group_order=order, range_bins=16)
+    image = np.zeros((0, 16, 96), np.uint8)
+    like = SonarFrames(image, sonar.range_m, sonar.bearing_rad, np.zeros(0), sonar)
+    part = Part(like, np.arange(2.0), lambda index: np.zeros((len(index), 16, 96), np.uint8))
+    cropped = part.cropped((0, 4), beams).like.sonar  # a shorter window, whose echoes would take less time
+    apart = beam_times(cropped) - beam_times(sonar)[slice(*beams)]
+    assert apart == pytest.approx(apart[0])
+    with pytest.raises(MitsonarError, match=r"got 17,81 of 96 beams; give multiples of (8|12)$"):
+        part.cropped(None, (17, 81))

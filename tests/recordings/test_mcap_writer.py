@@ -193,6 +193,14 @@ def test_attitudes_of_the_sonars_own_sensors_come_back(tmp_path: Path) -> None:
     assert back.attitude_rad == pytest.approx(attitude, abs=1e-12)
 
 
+def test_a_pitch_without_a_heading_comes_back(tmp_path: Path) -> None:
+    """Pictures with pitch_deg in their geometry file have no heading; without any attitude a frame keeps none."""
+    attitude = np.array([[0.1, 0.02, np.nan], [0.12, 0.01, 3.1], [0.1, 0.0, np.nan]])
+    frames = replace(over_ground(sway(3)), poses=None, height_m=None, attitude_rad=attitude)
+    back = open_recording(written(frames, tmp_path)).part()
+    assert back.attitude_rad == pytest.approx(attitude, abs=1e-12, nan_ok=True)
+
+
 def test_times_of_the_year_2026_come_back(tmp_path: Path) -> None:
     frames = over_ground(sway(4))
     frames = replace(frames, time_s=frames.time_s + 1_795_000_000.123456)

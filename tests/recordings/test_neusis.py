@@ -57,6 +57,7 @@ def test_values_above_one_are_divided_by_the_largest(tmp_path: Path) -> None:
     images = written(tmp_path, scale=3.0)
     recording = open_recording(tmp_path)
     assert any("values reach 2.99" in note for note in recording.notes)
+    assert "views have no times: they are ordered by name, at an assumed 10 Hz" in recording.notes
     assert recording.part().read([4]).image[0] == pytest.approx(images[4][:, ::-1] / images.max())
 
 

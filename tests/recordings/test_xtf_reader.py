@@ -265,6 +265,12 @@ def test_another_range_begins_another_part(tmp_path: Path) -> None:
     assert recording.part() is recording.parts[0]
 
 
+def test_a_window_without_its_end_begins_after_its_delay(tmp_path: Path) -> None:
+    file = Changed(tmp_path).headers(slant_range_m=0, delay_s=2 * 5 / 1500, duration_s=2 * 30 / 1500)
+    fan = file.pings(half_sound_speed=750).open().part().sounder.fan
+    assert (fan.range_min, fan.range_max) == pytest.approx((5, 35))
+
+
 def test_another_start_of_the_window_begins_another_part(tmp_path: Path) -> None:
     """The same end and number of samples; a start that moves with the sound speed, by 1 cm, begins none."""
     delays = [2 * near / 1500 for near in (2.0, 2.01, 6.0)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,4 +60,13 @@ def test_another_reader_reads_it(tmp_path: Path) -> None:
 def test_only_side_scans_are_written(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match="hold side-scans"):
         write_xtf(tmp_path / "line.xtf", echogram("altimeter"))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("first", [-5.0, 7.2581184e9, 5e11])
+def test_times_without_a_date_are_refused(tmp_path: Path, first: float) -> None:
+    """Datetime ended with a traceback at 5e11 s, and no reader takes a year before 1970."""
+    pings = echogram()
+    with pytest.raises(MitsonarError, match="seconds since 1970, to the year 2200: got "):
+        write_xtf(tmp_path / "line.xtf", replace(pings, time_s=pings.time_s - pings.time_s[0] + first))
     assert not list(tmp_path.iterdir())

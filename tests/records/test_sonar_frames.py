@@ -66,6 +66,22 @@ def test_npz_round_trip(tmp_path: Path, changed: dict[str, Any]) -> None:
     assert_same(SonarFrames.load(tmp_path), expected)  # the folder of a run
 
 
+def test_a_disk_that_is_full_leaves_the_frames_of_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "frames.npz"
+    frames().save(path)
+
+    def full(file: Any, **table: Any) -> None:
+        with file if hasattr(file, "write") else Path(file).open("wb") as opened:
+            opened.write(b"PK")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(OSError, match="No space"):
+        frames(poses=None).save(path)
+    assert_same(SonarFrames.load(path), frames())
+    assert [one.name for one in tmp_path.iterdir()] == ["frames.npz"]
+
+
 def test_zarr_group_reads_like_npz(tmp_path: Path) -> None:
     import zarr
 
@@ -112,6 +128,7 @@ def test_pitch_is_known_where_poses_are() -> None:
         ),
         ({"image": np.zeros((10, 6), np.float32)}, r"image must be .* got \(10, 6\)"),
         ({"time_s": np.zeros(3)}, r"image must be .*\(3, 10, 6\) after time_s"),
+        ({"image": np.ones(SHAPE, np.uint16)}, r"uint8 in 0\.\.255, or floats in 0\.\.1: got uint16"),
         ({"level": "log"}, "level must be one of linear, dB, gamma, contrast: got 'log'"),
         ({"poses": np.zeros((3, 6))}, "poses must hold 4 frames: got 3"),
         ({"height_m": np.zeros(5)}, "height_m must hold 4 frames: got 5"),

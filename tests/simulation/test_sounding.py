@@ -44,6 +44,13 @@ def test_an_altimeter_measures_the_nearest_ground(slope_deg: float) -> None:
     assert abs(result.range_m.item() - expected) < 1.5 * sounder.fan.bin_m
 
 
+def test_an_offset_of_the_detector_is_no_echo() -> None:
+    """Out of reach of the ground, a receiver shows its noise and the constant of its detector only."""
+    keys = {"range_min": 1, "range_max": 3, "range_bins": 40, "quality": "draft"}
+    sounder = load_sounder("altimeter").replace(detector_offset_db=100.0, **keys)
+    assert not SounderSimulator(floor(), sounder).soundings(flown(1)).found.any()
+
+
 def test_soundings_of_a_plane_lie_on_it() -> None:
     """Half a bin, in beams within 40 deg of straight down."""
     sounder = load_sounder("profiler").replace(model="physical", pattern="box", range_min=2, range_max=10, quality="fine")
