@@ -592,14 +592,18 @@ class _ReliefLevel:
         count = self.blocks[0] * self.blocks[1]
         return np.stack([np.bincount(number, (a * b).ravel(), minlength=count) for a, b in pairs])
 
-    def without_noise(self, equations: _Equations, prior: float, v: Doubles, heights: Doubles) -> _Equations:
+    def without_noise(self, equations: _Equations, prior: float, v: Doubles, heights: Doubles) -> _Equations | None:
         """Return equations whose second derivatives hold no noise of the slopes, if they still determine the motion.
+
+        None where too few cells remain.
 
         Slopes of one frame, as the gradient uses them, times those of the other, whose noise is independent. Outliers count
         with the derivative of weight times residual, which is negative.
         """
-        total = np.zeros((len(PAIRS), len(heights)))
-        for side, derivatives in zip(self._resample(v, heights) or (), self.sides, strict=True):
+        sides, total = self._resample(v, heights), np.zeros((len(PAIRS), len(heights)))
+        if sides is None:
+            return None
+        for side, derivatives in zip(sides, self.sides, strict=True):
             weight = cauchy(side.after - side.before, side.scale)
             weight *= np.float32(0.25) * (2 * weight - 1) * side.inside
             frames, middle = (side.before, side.after), (side.before + side.after) * np.float32(0.5)
@@ -692,8 +696,10 @@ def registered_over_relief(
                 break
     assert equations is not None
     assert heights is not None
-    lean_gradients = relief_level.gradients_by_lean(v, heights) if any(attitude.unsure) else None
     equations = relief_level.without_noise(equations, prior, v, heights)
+    if equations is None:
+        return None
+    lean_gradients = relief_level.gradients_by_lean(v, heights) if any(attitude.unsure) else None
     return v, _assessed(equations, prior, heights - relief_level.mean, relief_level, lean_gradients, converged=converged)
 
 
