@@ -167,6 +167,7 @@ def test_only_plugins_and_the_simulation_speak_mitsuba() -> None:
     }  # worlds and bridges only to check what Mitsuba would read
 
 
+@pytest.mark.thorough
 def test_kernels_compile_on_old_versions_of_llvm() -> None:
     """LLVM 15 and 16 end the process on these; `clipped` and `select` compare."""
     for path in (path for room in ("mitsonar", "plugins") for path in (ROOT / room).rglob("*.py")):
@@ -183,6 +184,7 @@ def test_every_module_says_what_it_is() -> None:
 # ---------------------------------------------------------------- what imports load
 
 
+@pytest.mark.thorough
 def test_import_sets_no_variant_and_loads_no_renderer() -> None:
     run_python("""
         import sys
@@ -212,6 +214,7 @@ def test_public_names_are_all_there() -> None:
     """)
 
 
+@pytest.mark.thorough
 def test_all_but_rendering_works_without_a_renderer() -> None:
     script = """
         import numpy as np, mitsonar, tempfile
@@ -233,6 +236,7 @@ def test_all_but_rendering_works_without_a_renderer() -> None:
     run_python(script, block=("mitsuba", "drjit", "torch"))
 
 
+@pytest.mark.thorough
 def test_rendering_works_without_torch() -> None:
     script = """
         import warnings
@@ -255,6 +259,7 @@ OPTIONAL = ("torch", "cv2", "trimesh", "distributed", "dask", "tifffile", "light
 """Packages of the extras that commands could need by accident."""
 
 
+@pytest.mark.thorough
 def test_commands_need_no_more_than_their_extra(tmp_path: Path) -> None:
     """`make demo` installs no extra: what draws and renders needs none, and odometry needs no torch."""
     script = """
@@ -279,6 +284,7 @@ def test_commands_need_no_more_than_their_extra(tmp_path: Path) -> None:
     run_python(script % odometry, block=tuple(name for name in OPTIONAL if name not in ("cv2", "tifffile")))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("package", "uses", "extra"),
     [
@@ -300,6 +306,7 @@ def test_a_missing_package_is_one_sentence_that_names_the_extra(package: str, us
     run_python(script, block=(package,))
 
 
+@pytest.mark.thorough
 def test_a_command_names_the_extra_that_it_lacks(tmp_path: Path) -> None:
     script = """
         import sys
@@ -348,6 +355,7 @@ def test_data_sets_are_made_without_torch(tmp_path: Path) -> None:
     run_python(script, block=("torch",))
 
 
+@pytest.mark.thorough
 def test_a_stored_set_is_read_without_a_simulator(tiny_data: Path) -> None:
     """Configuration stands below the simulation: who only reads enters no simulator and loads no Mitsuba."""
     run_python(f"""

@@ -121,6 +121,7 @@ def test_no_module_but_one_calls_what_only_unix_has() -> None:
     assert [name for name, calls in found.items() if calls] == ["mitsonar/io/system.py"], found
 
 
+@pytest.mark.thorough
 def test_text_files_name_their_encoding_and_their_line_ends() -> None:
     for path in SOURCES:
         found = text_without_encoding(path.read_text(encoding="utf-8"))
@@ -349,6 +350,7 @@ def without_unix(folder: Path, *arguments: str) -> str:
     return run_python(WITHOUT_UNIX.format(**given), PYTHONIOENCODING="cp1252", PYTHONUTF8="0")
 
 
+@pytest.mark.thorough
 @pytest.mark.e2e
 def test_a_scene_is_rendered_without_what_windows_lacks(mitsonar: Command, tmp_path: Path) -> None:
     """To the bits that are rendered with it, into a folder whose name the pipe cannot take."""

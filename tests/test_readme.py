@@ -24,6 +24,7 @@ SMALLER = {"dataset": ["--set", "world={family: rocky-field, a_side: [5, 10]}"]}
 """Fewer rocks are enough to see that a command works."""
 
 
+@pytest.mark.thorough
 def test_python_runs(tmp_path: Path) -> None:
     assert PYTHON
     for code in PYTHON:

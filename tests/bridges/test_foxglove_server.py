@@ -194,6 +194,7 @@ def test_poses_of_ros_are_understood(live: Live) -> None:
     client.close()
 
 
+@pytest.mark.thorough
 def test_a_client_that_no_longer_reads_does_not_keep_the_server() -> None:
     server = FoxgloveServer(PoseMailbox(), port=0)
     client = client_of(server.port, ["/sonar/image"])
@@ -226,6 +227,7 @@ def started(*words: str) -> tuple[subprocess.Popen[str], int]:
     return process, int(result[1])
 
 
+@pytest.mark.thorough
 @pytest.mark.posix
 @pytest.mark.e2e
 @pytest.mark.parametrize("number", essence([signal.SIGINT, signal.SIGTERM], signal.SIGTERM))
@@ -243,6 +245,7 @@ def test_a_path_is_played_and_a_signal_ends_the_server_cleanly(number: signal.Si
     assert "Traceback" not in complained
 
 
+@pytest.mark.thorough
 @pytest.mark.e2e
 def test_faults_of_the_command_are_one_sentence(mitsonar: Command, live: Live) -> None:
     refused(mitsonar(*SERVE, "--port", live.port, "--pings", 1), "cannot listen", "--port")

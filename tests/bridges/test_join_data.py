@@ -115,6 +115,7 @@ def test_data_sets_become_one_with_all_scenes(made: list[str], tmp_path: Path) -
     assert np.array_equal(shapes[0], np.concatenate(shapes[1:]))
 
 
+@pytest.mark.thorough
 def test_a_joined_data_set_is_joined_again(made: list[str], tmp_path: Path) -> None:
     first = joined(tmp_path / "first.zarr", made[0])
     both = joined(tmp_path / "both.zarr", str(tmp_path / "first.zarr"), made[1])
@@ -218,6 +219,7 @@ def test_a_sequence_of_both_is_refused(made: list[str], tmp_path: Path) -> None:
 # ---------------------------------------------------------------- memory
 
 
+@pytest.mark.thorough
 def test_one_run_at_a_time_is_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The peak of joining four runs in small shards is that of two."""
     monkeypatch.setattr("mitsonar.datasets.store.SHARD_BYTES", 2**20)

@@ -188,6 +188,7 @@ def test_stretches_end_at_pauses_and_where_poses_are_missing() -> None:
 # ---------------------------------------------------------------- what it is for
 
 
+@pytest.mark.thorough
 def test_compare_gives_the_errors_of_the_estimator_on_the_run(
     places: dict[str, Path], frames: SonarFrames, tmp_path: Path
 ) -> None:

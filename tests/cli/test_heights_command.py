@@ -48,6 +48,7 @@ def bare(run: Path) -> Path:
     return path
 
 
+@pytest.mark.thorough
 def test_a_run_becomes_a_mesh_a_geotiff_arrays_and_a_figure(mitsonar: Command, run: Path, tmp_path: Path) -> None:
     names = ["map.ply", "map.tif", "map.npz", "map.png"]
     out = [word for name in names for word in ("-o", tmp_path / name)]
@@ -66,6 +67,7 @@ def test_a_run_becomes_a_mesh_a_geotiff_arrays_and_a_figure(mitsonar: Command, r
     refused(mitsonar("heights", run, "-o", tmp_path / "map.ply"), "map.ply", "--overwrite")
 
 
+@pytest.mark.thorough
 def test_one_frame_without_a_pose_takes_height_and_pitch(mitsonar: Command, bare: Path, tmp_path: Path) -> None:
     words = ["heights", bare, "-o", tmp_path / "map.npz", "--cells", 20]
     refused(mitsonar(*words, "--only", 0), "does not state the poses", "--height and --pitch-deg")
@@ -78,6 +80,7 @@ def test_one_frame_without_a_pose_takes_height_and_pitch(mitsonar: Command, bare
         assert table["ground_m"] == 0
 
 
+@pytest.mark.thorough
 def test_a_pitch_or_roll_that_the_frame_lacks_is_not_taken_as_level(mitsonar: Command, bare: Path, tmp_path: Path) -> None:
     known = np.array([[np.radians(20), 0.0, 0.0], [np.nan, np.nan, np.nan]])
     replace(SonarFrames.load(bare), attitude_rad=known).save(tmp_path / "tilted.npz")
@@ -92,6 +95,7 @@ def test_a_pitch_or_roll_that_the_frame_lacks_is_not_taken_as_level(mitsonar: Co
     refused(mitsonar(*words, "--overwrite", "--only", 1), "frame 1 of", "no known roll, and")
 
 
+@pytest.mark.thorough
 def test_a_path_gives_the_poses(mitsonar: Command, run: Path, bare: Path, tmp_path: Path) -> None:
     Trajectory(POSES, SonarFrames.load(run).time_s).save(tmp_path / "path.tum")
     words = ["heights", bare, "-o", tmp_path / "map.npz", "--cells", 20, "--trajectory", tmp_path / "path.tum"]

@@ -36,6 +36,7 @@ def scene(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.thorough
 def test_it_writes_responses_and_figures(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     done = mitsonar("impulse", scene, "--velocity", "2,-1", "--frames", 20, "-o", out)
@@ -86,6 +87,7 @@ def test_killed_and_resumed_it_is_the_unbroken_one(mitsonar: Command, scene: Pat
     assert np.array_equal(first.response, second.response)
 
 
+@pytest.mark.thorough
 def test_a_course_by_name_and_keys_of_the_instrument(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     done = mitsonar(
@@ -99,6 +101,7 @@ def test_a_course_by_name_and_keys_of_the_instrument(mitsonar: Command, scene: P
     assert np.allclose(responses.velocity[:, :2], 1.0)
 
 
+@pytest.mark.thorough
 def test_fewer_pings_of_a_path_keep_its_velocity_and_some_receivers_may_do(
     mitsonar: Command, scene: Path, tmp_path: Path
 ) -> None:
@@ -114,6 +117,7 @@ def test_fewer_pings_of_a_path_keep_its_velocity_and_some_receivers_may_do(
     assert repr(responses).startswith("ImpulseResponses(4 pings, 1 receivers (right), 800 taps")
 
 
+@pytest.mark.thorough
 def test_standing_still_is_told(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     done = mitsonar("impulse", scene, "--frames", 2, "-o", tmp_path / "out")
     assert "does not move" in done.stderr
@@ -121,6 +125,7 @@ def test_standing_still_is_told(mitsonar: Command, scene: Path, tmp_path: Path) 
     np.testing.assert_allclose(response[1], response[0], atol=1e-6 * np.abs(response).max())
 
 
+@pytest.mark.thorough
 def test_a_receiver_that_hears_nothing_is_named(mitsonar: Command, tmp_path: Path) -> None:
     path = tmp_path / "scene.xml"
     path.write_text(
@@ -139,6 +144,7 @@ def test_a_receiver_that_hears_nothing_is_named(mitsonar: Command, tmp_path: Pat
     assert not ImpulseResponses.load(tmp_path / "out").response[0, 2].any()
 
 
+@pytest.mark.thorough
 def test_echoes_from_too_far_are_told(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     done = mitsonar("impulse", scene, "--set", "range_max=12", "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
@@ -200,6 +206,7 @@ def test_a_sea_surface_is_a_mirror_of_ones_own_scene(mitsonar: Command, tmp_path
     assert np.abs(runs["own"] - runs["none"]).max() > 0.1 * np.abs(runs["none"]).max()
 
 
+@pytest.mark.thorough
 def test_bodies_move(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     """The command places a body at the times of its pings, and says on which path it went."""
     fish = '<shape type="cube" id="fish"><transform name="to_world"><scale value="0.3"/></transform></shape></scene>'

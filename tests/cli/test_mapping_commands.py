@@ -128,6 +128,7 @@ def test_the_pictures_are_pictures(mitsonar: Command, drawn: Path, tmp_path: Pat
     assert mitsonar("mosaic", drawn, "true", "-o", tmp_path / "map.png", "--no-flatten", "--overwrite").returncode == 0
 
 
+@pytest.mark.thorough
 def test_sensors_and_loops_make_a_graph(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
     path = sway(20)
     save_sensors(tmp_path / "gyro.csv", simulated_sensors(path, SensorNoise(gyro_deg_rth=0.1)))
@@ -176,6 +177,7 @@ def test_frames_without_geometry_are_told_it(mitsonar: Command, tmp_path: Path) 
     assert not (tmp_path / "no").exists()
 
 
+@pytest.mark.thorough
 def test_a_long_run_and_some_of_its_frames(mitsonar: Command, tmp_path: Path) -> None:
     """Every second frame of frames.zarr; the mosaic takes the frames that have a pose, and says how many have none."""
     as_zarr(over_ground(sway(12)), tmp_path / "frames.zarr")
@@ -187,6 +189,7 @@ def test_a_long_run_and_some_of_its_frames(mitsonar: Command, tmp_path: Path) ->
     assert "warning: left out without a pose at their time: 6 of 12 frames" in done.stderr
 
 
+@pytest.mark.thorough
 def test_what_is_not_believed_is_warned_of(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
     frames = SonarFrames.load(drawn)
     frames.image[10:13] = 0

@@ -105,6 +105,7 @@ def test_commands_and_options_have_neighbours_too(mitsonar: Command, typed: str)
 # ---------------------------------------------------------------- options by the names that were typed
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("typed", "words"),
     [

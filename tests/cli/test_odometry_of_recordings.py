@@ -45,6 +45,7 @@ def test_the_path_of_a_recording_is_that_of_its_sonar(recording: Path, mitsonar:
     assert (tmp_path / "map.png").exists()
 
 
+@pytest.mark.thorough
 def test_without_a_height_one_is_assumed_and_told(recording: Path, mitsonar: Command, tmp_path: Path) -> None:
     done = mitsonar("odometry", recording, "-o", tmp_path / "path", "--workers", 1, "--closure", 0, "--every", 5)
     assert done.returncode == 0, done.stderr

@@ -86,6 +86,7 @@ def test_info_tells_gaps_and_notes(mitsonar: Command, frames: SonarFrames, tmp_p
     assert "2026-09-21" in table
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", essence(["npz", "zarr", "mcap"], "mcap"))
 def test_show_and_video(mitsonar: Command, places: dict[str, Path], tmp_path: Path, kind: str) -> None:
     done = mitsonar("recording", "show", places[kind], "--frame", 3, "-o", tmp_path / "a.png")
@@ -99,6 +100,7 @@ def test_show_and_video(mitsonar: Command, places: dict[str, Path], tmp_path: Pa
     assert (tmp_path / "a.mp4").stat().st_size > 1000
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", essence(["npz", "zarr", "mcap"], "mcap"))
 def test_frames_survive_folder_and_mcap_in_any_order(
     mitsonar: Command, places: dict[str, Path], frames: SonarFrames, tmp_path: Path, kind: str
@@ -145,6 +147,7 @@ def test_frames_become_an_aris_file(mitsonar: Command, places: dict[str, Path], 
     assert [one.name for one in tmp_path.iterdir()] == ["a.aris"]
 
 
+@pytest.mark.thorough
 def test_odometry_reads_what_was_converted(mitsonar: Command, places: dict[str, Path], tmp_path: Path) -> None:
     done = mitsonar("odometry", places["mcap"], "--estimator", "zero", "-o", tmp_path / "out")
     assert done.returncode == 0, done
@@ -169,6 +172,7 @@ def test_an_estimated_path_is_written_with_a_recording_that_has_none(
     )
 
 
+@pytest.mark.thorough
 def test_a_dark_frame_is_noted_and_drawn_below_another_top(mitsonar: Command, frames: SonarFrames, tmp_path: Path) -> None:
     replace(frames, image=(frames.image * 1e-5).astype(np.float32)).save(tmp_path / "dark.npz")
     done = mitsonar("recording", "show", tmp_path / "dark.npz", "-o", tmp_path / "a.png")
@@ -211,6 +215,7 @@ def test_a_missing_file_is_named_with_its_neighbour(mitsonar: Command, tmp_path:
     refused(mitsonar("recording", "info", tmp_path / "notes.mcap"), "XTF (.xtf)", "Sonar 3D-15 (.sonar)")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("words", "reason"),
     [

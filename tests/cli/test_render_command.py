@@ -119,6 +119,7 @@ def test_stored_echoes_are_binned_again_to_the_same_bits_and_to_others(
     np.testing.assert_allclose(np.minimum(levels, fewer.level_scale), fewer.image * fewer.level_scale, rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_quality_and_numbers_of_rays_are_chosen_on_the_command_line(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     def rays(*options: object) -> tuple[str, int, int]:
         done = mitsonar("render", scene, "-o", tmp_path / "out", "--overwrite", *options)

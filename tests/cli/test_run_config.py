@@ -71,6 +71,7 @@ def test_a_run_that_replaces_another_replaces_its_file(mitsonar: Command, tmp_pa
     assert yaml.safe_load((tmp_path / "a/run.yaml").read_text())["seed"] == 5
 
 
+@pytest.mark.thorough
 def test_soundings_repeat_too(mitsonar: Command, tmp_path: Path, scene: Path) -> None:
     sound = (
         "sound",

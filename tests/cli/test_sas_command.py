@@ -21,6 +21,7 @@ ENDS = ("--from", "0,-1.2,2.5,0,0,0", "--to", "0,1.2,2.5,0,0,0", "--speed", 0.5)
 SMALL = ("--element", 0.05, "--receivers", 4, "--set", "range_max=6", "--set", "carrier_hz=200e3")
 
 
+@pytest.mark.thorough
 def test_it_writes_what_it_promises_and_continues_where_it_was_interrupted(mitsonar: Command, tmp_path: Path) -> None:
     out = tmp_path / "out"
     done = mitsonar("sas", "flat_floor", *ENDS, *SMALL, "-o", out)

@@ -48,6 +48,7 @@ def test_info_of_a_line(mitsonar: Command, file: Path) -> None:
     assert summary["parts"][0]["height_m"] == pytest.approx([6, 6])
 
 
+@pytest.mark.thorough
 def test_waterfalls_have_a_water_column_over_slant_range_only(mitsonar: Command, file: Path, tmp_path: Path) -> None:
     for name, options in (
         ("slant.png", ()),
@@ -92,6 +93,7 @@ def test_a_map_lies_on_the_earth(mitsonar: Command, file: Path, tmp_path: Path) 
     assert north - 0.2 * rows < ORIGIN.north_m - 20 < north
 
 
+@pytest.mark.thorough
 def test_a_map_along_another_path_with_another_heading(mitsonar: Command, echogram: Echogram, tmp_path: Path) -> None:
     """A path 100 m further east whose headings lack a declination; the last quarter of the pings lies beyond it."""
     line = tmp_path / "line.npz"
@@ -133,6 +135,7 @@ def test_figures_of_a_map(mitsonar: Command, file: Path, tmp_path: Path) -> None
     assert (tmp_path / "map.quality.png").is_file()
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")
 def test_a_simulated_line_is_shown_and_mapped_as_a_real_one(mitsonar: Command, tmp_path: Path) -> None:
     out = tmp_path / "run"

@@ -102,6 +102,7 @@ def test_a_body_moves_and_a_run_tells_where(mitsonar: Command, tmp_path: Path) -
     refused(mitsonar("render", scene, "--moving", f"bell={tmp_path / 'ball.tum'}", "-o", tmp_path / "no"), "bell", "ball")
 
 
+@pytest.mark.thorough
 def test_frames_that_take_time_are_read_and_followed(mitsonar: Command, tmp_path: Path) -> None:
     """The file keeps a time and a pose for each beam; odometry and conversions take the middle of each frame."""
     run, out = tmp_path / "run", tmp_path / "path"

@@ -108,6 +108,7 @@ def test_standing_still_shows_the_jitter_alone() -> None:
         assert within < 0.7 * across
 
 
+@pytest.mark.thorough
 def test_any_zarr_reader_and_xarray_open_it(made: Path) -> None:
     """docs/guides/data-sets.md: no code of ours is needed."""
     import xarray
@@ -155,6 +156,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", essence(sorted(VARIANTS), "labels", "segments", "two sensors", "vectors"))
 def test_every_kind_of_data_set_is_made_and_checks(name: str, tmp_path: Path) -> None:
     recipe = tiny_recipe(scenes=[{"count": 1, "sequences": 10}], **VARIANTS[name])
@@ -197,6 +199,7 @@ def test_every_kind_of_data_set_is_made_and_checks(name: str, tmp_path: Path) ->
             assert np.ptp(z) > 0.5
 
 
+@pytest.mark.thorough
 def test_one_scene_in_two_shards_and_two_scenes_in_one(tmp_path: Path) -> None:
     """Whatever way frames are cut into files, they are the same frames."""
     recipe = tiny_recipe(scenes=[{"count": 1, "sequences": 7}, {"count": 1, "sequences": 12}])
@@ -222,6 +225,7 @@ def command(folder: Path, *options: object, recipe: dict[str, Any] | None = None
     return ["dataset", "make", str(path), "-o", str(folder / "tiny.zarr"), *map(str, options)]
 
 
+@pytest.mark.thorough
 def test_a_worker_that_lives_on_makes_the_data_set_that_it_is_asked_for(tmp_path: Path) -> None:
     """The same folder, another seed: nothing of the first may be in the second."""
     import shutil
@@ -240,6 +244,7 @@ def test_a_worker_that_lives_on_makes_the_data_set_that_it_is_asked_for(tmp_path
     np.testing.assert_array_equal(store.read("image", here), alone["image"])
 
 
+@pytest.mark.thorough
 def test_a_shard_that_vanishes_while_others_are_written_is_made_again(made: Path, tmp_path: Path) -> None:
     url = tmp_path / "tiny.zarr"
     harmed: list[Path] = []
@@ -295,6 +300,7 @@ def test_damaged_metadata_is_one_sentence(
     refused(mitsonar(*command(tmp_path, "--workers", 1, "--verify")), "damaged")
 
 
+@pytest.mark.thorough
 def test_killed_before_the_group_is_whole(made: Path, tmp_path: Path) -> None:
     """A file half written, or a group with arrays half made: begun anew."""
     url = tmp_path / "tiny.zarr"
@@ -452,6 +458,7 @@ def _wait(until: Callable[[], bool], seconds: float) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.thorough
 def test_no_scheduler_there(mitsonar: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mitsonar.datasets.make.CONNECT_TIMEOUT", "1s")
     done = mitsonar(*command(tmp_path, "--scheduler", "tcp://127.0.0.1:9"))
@@ -603,6 +610,7 @@ def test_a_data_set_begun_with_another_version_is_not_mixed(made: Path, tmp_path
         make_dataset(tiny_recipe(), str(url))
 
 
+@pytest.mark.thorough
 def test_an_unfinished_data_set_is_not_read_by_accident(tmp_path: Path) -> None:
     url = str(tmp_path / "tiny.zarr")
     recipe = tiny_recipe()
@@ -810,6 +818,7 @@ def test_a_store_that_is_not_there(bucket: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- command line
 
 
+@pytest.mark.thorough
 def test_commands_look_at_a_data_set(mitsonar: Command, made: Path, tmp_path: Path) -> None:
     shown = mitsonar("dataset", "info", made)
     assert shown.returncode == 0, shown.stderr

@@ -25,6 +25,7 @@ def long_plan() -> tuple[Recipe, Plan]:
     return recipe, Plan.of(recipe, 1200)
 
 
+@pytest.mark.thorough
 def test_labels_follow_from_poses_and_poses_from_labels() -> None:
     """To 1e-9: eq. 3.4 applied to each pose gives the next."""
     _, plan = long_plan()
@@ -61,6 +62,7 @@ def test_jumps_are_3_to_4_m_in_each_axis_with_any_heading() -> None:
 FLOWN = [("rocky-field", 300), ("ship-hull-physical", 150), ("looking-down-10m", 60), ("height-rocky", 60)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "sequences"),
     essence(FLOWN, ("rocky-field", 300), ("looking-down-10m", 60)),
@@ -134,6 +136,7 @@ def test_a_footprint_too_large_for_its_scene_is_an_error_not_a_loop() -> None:
         next(sequences_of(recipe, scenes_of(recipe, 1)[0]))
 
 
+@pytest.mark.thorough
 def test_heights_are_uniform() -> None:
     recipe = load_recipe("height-hull")
     sequences = islice(sequences_of(recipe, scenes_of(recipe, 3000)[0]), 200)

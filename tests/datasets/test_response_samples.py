@@ -49,6 +49,7 @@ def straight(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
 # ---------------------------------------------------------------- what is stored
 
 
+@pytest.mark.thorough
 def test_responses_are_what_the_simulator_hears(made: Path, tmp_path: Path) -> None:
     """Two routes: each scene is built, loaded and simulated here, ping by ping."""
     from mitsonar.simulation.channel import ChannelSimulator
@@ -82,6 +83,7 @@ def test_the_same_recipe_gives_the_same_bytes_and_a_lost_shard_comes_back(made: 
     assert files_of(url) == files_of(made)
 
 
+@pytest.mark.thorough
 def test_check_info_and_sheet(mitsonar: Command, made: Path, tmp_path: Path) -> None:
     assert check(DataStore.open(made)) == []
     table = info(DataStore.open(made))
@@ -360,6 +362,7 @@ def test_leaks_show_no_motion(made: Path) -> None:
         ImpulseSamples(made, leak="ping")  # type: ignore[arg-type]
 
 
+@pytest.mark.thorough
 def test_responses_are_read_without_torch_and_without_a_renderer(made: Path) -> None:
     script = f"""
         from mitsonar.datasets.responses import ImpulseSamples
@@ -405,6 +408,7 @@ def test_estimators_are_compared_on_its_samples(mitsonar: Command, straight: Pat
 # ---------------------------------------------------------------- regressors
 
 
+@pytest.mark.thorough
 def test_regressors_are_those_of_the_table() -> None:
     """Table 5.4; a linear relation is found by the linear ones, and by all better than by no answer."""
     assert len(REGRESSORS) == 10

@@ -120,6 +120,7 @@ def test_absorption_exponent_and_pattern_multiply_the_levels() -> None:
 # ---------------- Known values come back
 
 
+@pytest.mark.thorough
 def test_simulated_values_come_back(simulated: SonarFrames) -> None:
     result = calibrate_sonar(simulated)
     found = {name: one.value for name, one in result.parameters.items()}
@@ -168,6 +169,7 @@ def test_gains_of_beams_come_back() -> None:
     assert calibrate_sonar(drawn(PLACES, 1, 5, gain_db)).beam_gain_db is None
 
 
+@pytest.mark.thorough
 def test_given_values_stay() -> None:
     result = calibrate_sonar(drawn(PLACES, 1, 7), taper_db=3.0, gain_exponent=2, height_m=1.9)
     for name, value in (("taper_db", 3.0), ("range_exponent", 0.0), ("height_m", 1.9)):
@@ -183,6 +185,7 @@ def test_absorption_that_the_gain_undoes_is_not_written() -> None:
     assert result.fit.sonar.absorption_db_per_m == SHEET.absorption_db_per_m
 
 
+@pytest.mark.thorough
 def test_one_place_does_not_determine_everything() -> None:
     """Without poses, a height and a width over elevation that are both larger give nearly the same levels."""
     frames = replace(drawn(PLACES[:1], 2, 9), poses=None)
@@ -212,6 +215,7 @@ def test_an_aris_over_a_bottom(mitsonar: Command, tmp_path: Path) -> None:
 # ---------------- What cannot work
 
 
+@pytest.mark.thorough
 def test_frames_without_ground_are_refused() -> None:
     water = drawn(PLACES, 1, 11)
     image = water.image.copy()
@@ -240,6 +244,7 @@ def test_unusable_frames_are_refused() -> None:
         calibrate_sonar(replace(frames, image=bright))
 
 
+@pytest.mark.thorough
 def test_the_command_writes_what_the_simulator_reads(mitsonar: Command, tmp_path: Path) -> None:
     drawn(PLACES, 2, 13).save(tmp_path / "frames.npz")
     out = tmp_path / "sonar.yaml"

@@ -70,6 +70,7 @@ def group_stripes(sonar: Sonar, spread: float) -> float:
     return float(np.random.default_rng([sonar.seed, 0x67726F75]).normal(0, spread, sonar.ping_groups).std())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", essence([name for name in TRUE if name != "unstated groups"], "dB"))
 def test_what_was_put_in_comes_out(recordings: dict[str, SonarFrames], name: str) -> None:
     result, true = fit_sonar(recordings[name]), TRUE[name]

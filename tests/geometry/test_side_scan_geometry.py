@@ -29,6 +29,7 @@ def bright(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------- bottom
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (0.35, 0.0), (-0.2, 0.1)])
 def test_the_first_return_is_the_distance_to_the_ground_in_the_plane_of_the_beams(pitch: float, roll: float) -> None:
     """Heights from 3 to 9 m, within a bin."""
@@ -40,6 +41,7 @@ def test_the_first_return_is_the_distance_to_the_ground_in_the_plane_of_the_beam
     assert track.contrast.min() > 0.9
 
 
+@pytest.mark.thorough
 def test_speckle_and_noise_move_the_track_by_a_few_bins_at_most() -> None:
     """Exponential speckle, and water 17 dB below the bottom."""
     poses = line(200)

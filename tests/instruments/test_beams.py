@@ -37,6 +37,7 @@ def test_the_pattern_is_the_sum_over_the_aperture(shading: Shading) -> None:
     np.testing.assert_allclose(aperture.spectrum().at(u), aperture.pattern(u), atol=2e-4)
 
 
+@pytest.mark.thorough
 def test_an_array_out_of_focus_is_wider_and_lower() -> None:
     aperture = Aperture(0.005)
     sharp, blurred = (np.abs(aperture.spectrum(bend * 8e-4).at(np.linspace(-0.05, 0.05, 4001))) for bend in (0.0, 0.4))
@@ -46,6 +47,7 @@ def test_an_array_out_of_focus_is_wider_and_lower() -> None:
     assert abs(abs(near) - 1) < 2e-3  # far from the near field's edge nothing changes
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("shading", SHADINGS)
 def test_array_errors_raise_lobes_everywhere(shading: Shading) -> None:
     """Beside the main lobe the mean power is error^2 sum w^2 of elements half a wavelength apart, each a short sinc."""

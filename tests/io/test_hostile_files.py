@@ -126,6 +126,7 @@ def test_a_lone_carriage_return_in_a_path_is_refused(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- mutants
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", cases())
 def test_mutants_are_read_or_refused(name: str, tmp_path: Path) -> None:
     count = FEW if name in OWN or "zarr" in name or name == "data set" else FOREIGN
@@ -169,6 +170,7 @@ quick = settings(
 )
 
 
+@pytest.mark.thorough
 @settings(quick, max_examples=10)
 @given(key=some.sampled_from([*TINY["sonar"], "jitter", "seed", "sound_speed", "range_min", "range_max"]), value=values)
 def test_any_value_of_a_sonar(key: str, value: Any) -> None:

@@ -51,6 +51,7 @@ def run(folder: Path, measured: ImpulseResponses, stop_at: int = 10**9, **keys: 
     return report.image.value
 
 
+@pytest.mark.thorough
 def test_a_run_that_was_stopped_continues_to_the_same_bits(measured: ImpulseResponses, tmp_path: Path) -> None:
     whole = run(tmp_path / "whole", measured)
     np.testing.assert_array_equal(whole, focus(measured, GRID).value)
@@ -75,6 +76,7 @@ def test_a_damaged_part_is_one_sentence(measured: ImpulseResponses, tmp_path: Pa
             run(tmp_path / "run", measured)
 
 
+@pytest.mark.thorough
 def test_a_navigation_replaces_the_poses_and_must_cover_the_pings(measured: ImpulseResponses, tmp_path: Path) -> None:
     """A navigation 0.5 m farther along moves the image by that much."""
     flown = track(40, 0.2)

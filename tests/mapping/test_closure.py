@@ -123,6 +123,7 @@ def test_loops_with_invalid_motions_are_left_out_and_one_loop_is_none() -> None:
     assert closure_of(source, known, numbers, estimate_motions(source, known, numbers), STEPS) is None
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("small", [1, 5])
 def test_a_wrong_match_is_refused_and_right_ones_still_show_covariances_that_are_too_small(small: int) -> None:
     """A loop of 0.3 m in 200 is left out; the others have the factor of the path without it, 1 or 25."""

@@ -79,6 +79,7 @@ def rmse(values: Array, true: Array) -> float:
     return float(np.sqrt(np.nanmean(np.square(values - true))))
 
 
+@pytest.mark.thorough
 def test_one_frame_gives_hills_and_their_uncertainty() -> None:
     result, true = fitted(1)
     seen = np.isfinite(result.height_m)
@@ -91,6 +92,7 @@ def test_one_frame_gives_hills_and_their_uncertainty() -> None:
     assert result.regulariser.deviance == min(trial.deviance for trial in result.trials)
 
 
+@pytest.mark.thorough
 def test_frames_from_all_sides_give_a_better_map_than_one() -> None:
     one, several = fitted(1)[0], fitted(3)[0]
     true = fitted(3)[1]
@@ -153,12 +155,14 @@ def test_frames_without_a_shadow_do_not_lower_a_wall() -> None:
     np.testing.assert_allclose(joined_shadow_heights(views, both, 1.0)[shared], np.mean(each, axis=0)[shared])
 
 
+@pytest.mark.thorough
 def test_the_same_frames_give_the_same_map() -> None:
     frames, poses, _ = drawn(1)
     again = fit_height_map(frames, poses, np.array([HEIGHT_M]), SMALL)
     np.testing.assert_array_equal(again.height_m, fitted(1)[0].height_m)
 
 
+@pytest.mark.thorough
 def test_a_rejected_regulariser_leaves_the_map_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same map comes out when only the regularisers are tried that the search has taken."""
     result, _ = fitted(1)

@@ -82,6 +82,7 @@ def wrong_estimates() -> list[Estimate]:
     return [Estimate(Motion(*one.tolist()), np.diag([3e-4, 3e-4, 3e-4]) ** 2) for one in wrong]
 
 
+@pytest.mark.thorough
 def test_the_map_takes_out_what_pairs_of_frames_get_wrong() -> None:
     frames = run()
     result = mapped(FrameSource.of(frames), np.arange(FRAMES), wrong_estimates())

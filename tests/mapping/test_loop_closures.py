@@ -116,6 +116,7 @@ def test_blank_frames_have_no_view() -> None:
 # ---------------------------------------------------------------- loops
 
 
+@pytest.mark.thorough
 def test_a_circle_is_closed_where_it_began(round_trip: tuple[SonarFrames, Drifting]) -> None:
     frames, estimator = round_trip
     path = estimator.path

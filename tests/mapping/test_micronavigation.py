@@ -55,6 +55,7 @@ def field(noise: float) -> ImpulseResponses:
     return replace(quiet, response=quiet.response + none.response)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("noise", "coherence"), [(0.3, 1 / 1.09), (0.7, 1 / 1.49)])
 def test_the_sway_comes_back_near_its_bound(noise: float, coherence: float) -> None:
     """Coherence 1 / (1 + noise^2); the error is at most 1.5 times the bound, which is 100 times below the sway."""
@@ -131,6 +132,7 @@ def with_noise_alone(quiet: ImpulseResponses, pings: list[int]) -> ImpulseRespon
     return replace(quiet, response=response)
 
 
+@pytest.mark.thorough
 def test_pairs_that_are_not_coherent_are_counted_and_refused_if_there_are_no_others() -> None:
     found = displaced_phase_centres(with_noise_alone(quiet_field(), [10]))
     assert np.flatnonzero(np.isnan(found.sway_m)).tolist() == [9, 10]

@@ -340,6 +340,7 @@ def test_illumination_is_taken_out() -> None:
 # ---------------------------------------------------------------- runs, memory, bounds
 
 
+@pytest.mark.thorough
 def test_chunks_and_whole_runs_make_one_map() -> None:
     """Frames that come in chunks, poses of another path, first and last frame whole with `centre`."""
     poses = np.array([looking(3 * k, x=0.2 * k) for k in range(9)])

@@ -298,6 +298,7 @@ def test_scale_fits_what_was_shrunk() -> None:
     assert "scale of yaw, as given" in [name for name, _, _ in given.rows()]
 
 
+@pytest.mark.thorough
 def test_smoothing_takes_noise_from_motions_and_hardly_changes_the_end() -> None:
     """Why `none` is the default: over ten draws, the RMSE of motions falls, and that of the end stays as it is."""
     path = sway(200)

@@ -198,6 +198,7 @@ def test_the_period_is_halved() -> None:
         np.testing.assert_allclose(smooth[inside, 1] @ swing[inside] / (swing[inside] @ swing[inside]), stored, rtol=2e-3)
 
 
+@pytest.mark.thorough
 def test_the_period_minimises_generalised_cross_validation() -> None:
     """Against the definition: the hat matrix of SciPy's spline, column by column."""
     _, measured = swaying(40)
@@ -477,6 +478,7 @@ def test_the_ellipse_holds_its_share() -> None:
         ellipse(covariance, 95)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("smoothed", [False, True])
 def test_pose_covariance_against_monte_carlo(smoothed: bool) -> None:
     """Independent errors, and the correlated ones of the smoother drawn from the dense solution."""

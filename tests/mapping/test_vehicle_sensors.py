@@ -199,6 +199,7 @@ def test_smoothing_takes_noise_out_and_little_of_a_sway() -> None:
     np.testing.assert_allclose(constant, 3, rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_the_noise_of_the_roll_is_in_each_motion_and_does_not_add_up() -> None:
     """Yaws and the last heading of the paths of 40 dives, over their variances."""
     vehicle, sonar = rolling()

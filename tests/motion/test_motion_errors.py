@@ -59,6 +59,7 @@ def test_honest_covariances_have_a_nees_of_one() -> None:
     assert motion_errors(truth + error, truth, np.ones(5000, bool), stacked).nees == pytest.approx(1, abs=0.07)
 
 
+@pytest.mark.thorough
 def test_clustered_intervals_cover_where_plain_ones_do_not() -> None:
     """Scenes with errors of their own: intervals by scene hold the true RMSE far more often than plain ones."""
     rng = np.random.default_rng(3)

@@ -73,6 +73,7 @@ def test_objects_of_one_mesh_have_a_border(frames: SonarFrames) -> None:
     assert (one[1:][touching] == 0).mean() > 0.8
 
 
+@pytest.mark.thorough
 def test_a_figure_names_what_it_shows(frames: SonarFrames) -> None:
     def names_in(index: int) -> list[str]:
         figure = fan_figure(frames, index, outlines=outlines_of(frames, [("sand", "")]))
@@ -127,6 +128,7 @@ def test_colours_repeat_and_are_opaque() -> None:
     assert table[1].tolist() == table[len(COLOURS) + 1].tolist() == [*COLOURS[0], 255]
 
 
+@pytest.mark.thorough
 def test_commands_draw_labels(mitsonar: Command, run: Path, variant: str, tmp_path: Path) -> None:
     from mitsonar.datasets.make import make_dataset
 

@@ -413,6 +413,7 @@ def test_a_hostile_file_is_refused(xml: Path, content: str) -> None:
         load_scene(xml)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "shapes"),
     [

@@ -123,6 +123,7 @@ KEPT = """
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("order", essence(ORDERS, "mitsuba, variant, mitsonar"))
 def test_order_of_imports_and_variants(order: str) -> None:
     run_python(textwrap.dedent(SCENE) + textwrap.dedent(ORDERS[order]))
@@ -182,6 +183,7 @@ def test_a_typing_slip_is_an_error(name: str) -> None:
         mi.load_dict({"type": name, **NEEDED.get(name, {}), "sead": 3})
 
 
+@pytest.mark.thorough
 def test_asking_whether_mitsuba_is_there_does_not_lose_the_plugins() -> None:
     run_python("""
         import importlib.util, mitsonar
@@ -202,6 +204,7 @@ def test_every_plugin_is_known_by_its_kind() -> None:
     assert result == {(kind, name) for kind, names in KINDS.items() for name in names}
 
 
+@pytest.mark.thorough
 def test_scalar_variants_name_the_variant_that_is_needed() -> None:
     """In Mitsuba's own loader, for each plugin; in load_scene, which leaves the user's variant as it is."""
     output = run_python("""

@@ -111,6 +111,7 @@ def smooth_bitmap() -> MitsubaDict:
     return {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True, "wrap_mode": "mirror"}
 
 
+@pytest.mark.thorough
 def test_textured_meshes() -> None:
     """Bitmap, checkerboard, noise by uv and by position, and a texture within `twosided`, side by side."""
     checkers = {"type": "checkerboard", "color0": 0.2, "color1": 0.9, "to_uv": mi.ScalarTransform3f().scale(4)}
@@ -161,6 +162,7 @@ def test_attributes_of_a_mesh_from_above_and_below() -> None:
     assert np.abs(np.array(si.n).T[valid] - np.array(si.sh_frame.n).T[valid]).max() > 0.01
 
 
+@pytest.mark.thorough
 def test_shapes_that_are_no_meshes() -> None:
     plain, noise = diffuse(0.3), diffuse({"type": "perlin", "cells": 4})
     cylinder = {"type": "cylinder", "p0": [-2, 1, 0], "p1": [2, 1, 0], "radius": 0.3, "bsdf": plain}
@@ -170,6 +172,7 @@ def test_shapes_that_are_no_meshes() -> None:
     )
 
 
+@pytest.mark.thorough
 def test_instances() -> None:
     """Their points, normals and reflectivities are Mitsuba's; the shape is the instance, not the group's member."""
     group = {

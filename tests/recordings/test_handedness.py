@@ -132,6 +132,7 @@ def test_real_fans_turn_as_their_registration_says(name: str) -> None:
     assert check_handedness(part, -heading).verdict == "mirrored"
 
 
+@pytest.mark.thorough
 @with_samples
 @pytest.mark.parametrize("name", ["lamprey2", "lamprey4"])
 def test_a_fish_before_a_sonar_at_rest_tells_nothing(name: str) -> None:

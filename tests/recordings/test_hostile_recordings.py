@@ -246,6 +246,7 @@ def _messages_are_compiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"rosbags.serde.{module}.compile_lines", lambda lines: compiled("\n".join(lines)))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("first", essence([0, FIRST], 0))
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_mutants_are_read_or_refused(name: str, first: int, tmp_path: Path) -> None:
@@ -287,6 +288,7 @@ def test_a_log_that_unpacks_to_more_than_it_says_is_refused(tmp_path: Path) -> N
     assert most < MEMORY_FLOOR
 
 
+@pytest.mark.thorough
 def test_a_log_that_says_that_it_unpacks_to_much_is_left_out(tmp_path: Path) -> None:
     ping = some_pings(1)[0]
     packed = zlib.compress(ping + bytes(200 * 2**20), 9)
@@ -305,6 +307,7 @@ def _longer(head: bytes, packed: bytes) -> bytes:
     return bytes(result)
 
 
+@pytest.mark.thorough
 def test_many_marks_of_messages_do_not_take_long(tmp_path: Path) -> None:
     """Two million marks, none of which begins a message, behind a good ping."""
     (tmp_path / "a.raw").write_bytes(some_pings(1)[0] + b"SO" * 2_000_000)
@@ -319,6 +322,7 @@ def test_many_marks_in_a_log_of_a_ping360_do_not_take_long(tmp_path: Path) -> No
     assert outcome(lambda: open_recording(tmp_path / "a.bin")) == "read"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("packed", [False, True])
 def test_damaged_range_images_with_a_right_checksum(tmp_path: Path, packed: bool) -> None:
     """Of packed messages those bytes are changed, too, that Snappy reads."""
@@ -350,6 +354,7 @@ def test_packets_that_unpack_to_more_than_they_say_are_left_out(tmp_path: Path) 
         assert most < MEMORY_FLOOR
 
 
+@pytest.mark.thorough
 def test_packets_of_many_fields_are_left_out(tmp_path: Path) -> None:
     """Packets of 13 kB that unpack to 130,000 fields each, with a right checksum: parsing them all would take minutes."""
     packed = b"\x80\x80\x10" + b"\x04\x58\x00" + b"\xfe\x02\x00" * 4095 + b"\xf6\x02\x00"

@@ -56,6 +56,7 @@ def test_the_layout_of_the_beams_follows_the_sample() -> None:
     assert np.degrees(frames.sonar.bearing_rad - frames.bearing_rad) == pytest.approx(0, abs=0.02)
 
 
+@pytest.mark.thorough
 @with_sample
 def test_the_sonar_of_the_sample_is_estimated_to_stand_still() -> None:
     with pytest.warns(MitsonarWarning, match="no times in a known unit"):

@@ -270,6 +270,7 @@ def table_of(folder: Path) -> list[Row]:
     return [{name: value for name, value in row.items() if name != "ms"} for row in rows]
 
 
+@pytest.mark.thorough
 def test_a_killed_benchmark_goes_on_to_the_same_bits(run_of: Path, tmp_path: Path) -> None:
     expected = Wanted((str(run_of),), methods=("zero", "direct", "flow"))
     benchmark_odometry(expected, tmp_path / "whole")
@@ -372,6 +373,7 @@ def small_hull(self: ShipHull, seed: int) -> World:
 BUILD = ShipHull.build
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("variant")
 def test_one_command_renders_a_set_and_makes_its_row(mitsonar: Command, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr(ShipHull, "build", small_hull)

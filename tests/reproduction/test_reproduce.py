@@ -240,6 +240,7 @@ REACHED = Reached(
 )
 
 
+@pytest.mark.thorough
 def test_a_table_shows_all_rows_and_the_scale_of_each() -> None:
     table = table_named("3.7")
     halves = {"none": score(5.0), "high": score(7.0)}

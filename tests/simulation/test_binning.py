@@ -104,6 +104,7 @@ def bin_in_numpy(echoes: Echoes, sonar: Sonar) -> tuple[np.ndarray, dict[str, np
     return levels, {name: np.bincount(beam[chosen], minlength=sonar.beams) for name, chosen in which.items()}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", SONARS)
 def test_fused_image_equals_numpy_on_the_stored_echoes(world: mi.Scene, tmp_path: Path, name: str) -> None:
     sonar = SONARS[name]
@@ -153,6 +154,7 @@ def threads() -> Iterator[None]:
     dr.set_thread_count(count)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("name", ["physical", "thesis"])
 def test_one_thread_or_two(world: mi.Scene, name: str) -> None:

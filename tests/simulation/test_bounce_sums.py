@@ -55,6 +55,7 @@ CASES = [
 ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("depth", "place", "tilt"), essence(CASES, CASES[0], CASES[2]))
 def test_ghosts_lie_where_image_sources_say(depth: float, place: tuple[float, float, float], tilt: float) -> None:
     """Ranges within one bin and levels within 5 %; a flat surface keeps the bearing, so both ways arrive in one beam."""
@@ -156,6 +157,7 @@ def test_labels_are_those_of_one_reflection() -> None:
     assert (result[1].levels != result[0].levels).any()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("pattern", ["box", "receive"])
 def test_groups_of_beams_at_rest_are_one_ping(pattern: str) -> None:
     """Groups that ping from one pose make the image of all beams at once."""

@@ -54,6 +54,7 @@ def test_a_rigid_sphere_has_half_its_radius() -> None:
     assert strength(length_at(rigid, band(1.8e6, 2e5), RHO, C)) == pytest.approx(20 * math.log10(0.01905 / 2), abs=0.01)
 
 
+@pytest.mark.thorough
 def test_its_first_echo_is_that_of_a_mirror() -> None:
     """In time: V a / 2, 2 a / c before the centre's. Later echoes, from inside and around, add the rest of the power."""
     step = 2e3

@@ -345,6 +345,7 @@ def test_absorption_also_lowers_the_direct_arrival() -> None:
     assert abs(arrivals.amplitude[0]) == pytest.approx(10 ** (-0.25 * 8 / 20) / 8, rel=1e-5)
 
 
+@pytest.mark.thorough
 def test_a_line_weighs_the_echoes_of_a_plate_by_its_pattern() -> None:
     """Plates at several angles off the beam, side lobes with their sign included."""
     wide = ChannelSonar(receivers=(received_from(),), points_per_m2=1e5)

@@ -89,6 +89,7 @@ def test_speckle_is_exponential(flat: mi.Scene) -> None:
     assert stats.kstest(thinned / thinned.mean(), "expon").pvalue > 0.01
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("nu", essence([1.0, 4.0], 1.0))
 def test_patches_make_speckle_heavier(flat: mi.Scene, nu: float) -> None:
     source = imager(flat, SONAR.replace(speckle_nu=nu, speckle_patch_m=0.15))
@@ -197,6 +198,7 @@ def test_neighbours_correlate_as_pattern_and_pulse_say(flat: mi.Scene) -> None:
             assert got == pytest.approx(truth**2, abs=0.03)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("looks", essence([2, 3], 2))
 def test_looks_average_the_power_of_shorter_pulses(flat: mi.Scene, looks: int) -> None:
     """The mean power stays: of ground, noise and water. The variance is the mean of c^2 over pairs of looks."""
@@ -298,6 +300,7 @@ def before(flat: mi.Scene) -> tuple[CoherentImager, Array]:
     return source, np.stack([source.image(POSE + shift, 0)[0][CELLS] for shift in SHIFTS])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", essence(MOTIONS, *ESSENCE))
 def test_speckle_follows_a_motion_as_theory_says(before: tuple[CoherentImager, Array], name: str) -> None:
     """Fields before and after, weighted by the predicted phase of each pixel: the coherence within 0.03 of the integral."""

@@ -62,6 +62,7 @@ def floor_echo_db(sonar: Sonar, height: float) -> Array:
 PRESETS = sorted(set(named_sonars()) - {"lookdown100"})
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", essence(PRESETS, "blueview-p900-45"))
 @pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")
 def test_the_sonar_equation_holds_for_every_preset(flat: mi.Scene, name: str) -> None:

@@ -34,6 +34,7 @@ print("alive")
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="maps memory as Linux does")
 def test_a_launch_over_an_array_reads_nothing_behind_its_page() -> None:
     """Without ``padded`` the process ends by SIGSEGV: 1,604 is no multiple of 16."""

@@ -100,6 +100,7 @@ def test_on_a_plane_they_are_central_differences(by: int, step: float) -> None:
     assert slope(simulator, by) == pytest.approx(difference(simulator, by, step), rel=1e-3)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("height", essence([0.35, 0.0], 0.0))
 def test_edges_make_them_central_differences(height: float, tmp_path: Path) -> None:
     """A cube above the ground covers it, and one that is cut by the ground moves the line where they meet."""
@@ -120,6 +121,7 @@ def test_a_turn_about_the_vertical_keeps_what_lies_inside(tmp_path: Path) -> Non
     assert abs(slope(simulator, 5, even)) < 1e-3 * abs(slope(simulator, 5, one_side.astype(float)))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("shape", essence(["sphere", "cylinder", "disk", "rectangle"], "sphere"))
 def test_outlines_of_shapes_that_are_no_meshes(shape: str) -> None:
     """The difference of the ends of a step is the mean of the derivative along it."""

@@ -50,6 +50,7 @@ def test_it_is_the_mean_of_coherent_pings(flat: mi.Scene, pattern: str) -> None:
     assert np.abs(10 * np.log10(ratio)).max() < 0.4
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("layout", ["even", "sine"])
 def test_a_wide_fan_is_the_mean_of_coherent_pings_at_all_bearings(flat: mi.Scene, layout: str) -> None:
     """Beams broaden to the sides, by the cosine of the bearing, 0.42 at the edge; eighths of the fan within 0.5 dB."""

@@ -84,6 +84,7 @@ def test_the_mean_field_of_random_heights_falls_as_rayleigh_says() -> None:
     assert abs(mean / total) == pytest.approx(loss, abs=4 * height * 4 * np.pi * CARRIER / C / np.sqrt(60) / 4)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("step", essence([0.4, 0.5], 0.4))
 def test_the_mean_field_of_a_sea_does_not_depend_on_what_its_mesh_holds(step: float) -> None:
     """Two scales: waves of the mesh by Kirchhoff, shorter ones by the loss; together exp(-2 k^2 h^2 cos^2) of all.

@@ -46,6 +46,7 @@ def test_four_receivers_at_one_metre_a_second() -> None:
     assert spread_of(each) == max(alone, key=lambda one: one.factor)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("variant")
 def test_a_run_goes_on_only_with_the_velocities_that_it_began_with(tmp_path: Path) -> None:
     channel = simulator(ChannelSonar(), floor=cells_floor())

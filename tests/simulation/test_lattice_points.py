@@ -123,6 +123,7 @@ def spread_over_grid(points: SurfacePoints, tracer: Any) -> NDArray[np.complex12
     return total
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("scenery", essence(["floor", "corner", "patches"], "corner"))
 def test_images_and_impulse_responses_have_one_field(scenery: str) -> None:
     """The points that a channel sonar stores, summed here in NumPy, give the field that the imaging sonar's rays find."""

@@ -250,6 +250,7 @@ def test_a_mesh_of_planes_is_a_tank() -> None:
     assert paths.amplitude[order] * lengths == pytest.approx([target[length] for length in sorted(target)], rel=1e-5)
 
 
+@pytest.mark.thorough
 def test_more_orders_of_planes_than_can_be_traced_are_refused() -> None:
     plates = {f"p{k}": plate((0, 0, 30.0 + k), (0, 0, -1), half=1.0) for k in range(40)}
     parts = dict.fromkeys(plates, (0.5, 0.0))

@@ -34,6 +34,7 @@ def test_every_cell_has_one_point_inside_it_whoever_looks() -> None:
     assert not np.array_equal(points(different), place)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("shape", essence(["rectangle", "mesh", "sphere"], "mesh"))
 def test_strengths_add_up_to_reflectivity_times_area(shape: str) -> None:
     kinds = {
@@ -85,6 +86,7 @@ def test_bodies_hide_what_is_behind_them() -> None:
     assert hidden.delay_s.min() > 2 * 10.19 / C  # straight below nothing is left
 
 
+@pytest.mark.thorough
 def test_energy_is_that_of_the_imaging_sonar() -> None:
     """Two routes to the energy of the floor: echoes of a receiver at the transmitter, and pixels of an image.
 

@@ -167,6 +167,7 @@ def test_ranges_outside_are_sought_for_the_warning_only(ground: mi.Scene, monkey
 # ---------------------------------------------------------------- impulse responses
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("model", ["scatterers", "rays"])
 def test_stepped_channels_are_those_of_one_run(model: Literal["scatterers", "rays"]) -> None:
     """A velocity is told to each step: one pose alone does not say it."""

@@ -55,6 +55,7 @@ def poses() -> Array:
     return result
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("diameter", essence([0.002, 0.004, 0.008], 0.004))
 @pytest.mark.parametrize("mesh", [True, False])
 def test_a_thin_rod_has_the_energy_of_its_diameter_in_every_ping(
@@ -132,6 +133,7 @@ def test_flipped_normals_change_nothing() -> None:
     assert centroid == pytest.approx([AHEAD - 0.008] * 2, abs=0.004)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("mesh", [True, False])
 def test_a_thin_shape_moves_between_pings(tmp_path: Path, mesh: bool) -> None:
     """By its vertices or its transform, as any other shape of a live scene."""

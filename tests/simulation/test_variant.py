@@ -37,6 +37,7 @@ def test_cuda_that_is_absent_is_said() -> None:
         ensure_variant("cuda_ad_mono")
 
 
+@pytest.mark.thorough
 def test_environment_forces_a_variant_and_a_missing_llvm_is_named() -> None:
     script = """
         from mitsonar.simulation.device import ensure_variant

@@ -284,6 +284,7 @@ def test_a_trained_corrnet_comes_along(mitsonar: Command, made: Path, pairs: Son
     refused(mitsonar("evaluate", "./corrnet", made), "no checkpoint", "or corrnet")
 
 
+@pytest.mark.thorough
 def test_its_own_covariances_are_judged(geometric: Checkpoint, made: Path) -> None:
     row, _ = evaluate(geometric, made, noise=["none"], part="all")["tables"][0]["rows"]
     local = samples_for(geometric, made, part="all")
@@ -419,6 +420,7 @@ def test_a_comparison_marks_pairs_that_a_network_may_have_learnt_from(mitsonar: 
     assert not rendered.learnt(by_sequence).any()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("by", ["sequence", "scene"])
 def test_what_was_learnt_is_known_in_a_shorter_data_set_of_the_recipe(made: Path, tmp_path: Path, by: str) -> None:
     """Its sequences are in the longer one, but in other parts: their poses tell which of them training has had."""

@@ -77,6 +77,7 @@ ROWS = ((400, 32), (200, 64), (100, 128), (50, 256), (25, 512), (13, 512), (7, 5
 """Table 5.1: cells along the delay and channels of each convolution; 4 cells across in all of them."""
 
 
+@pytest.mark.thorough
 def test_the_layers_are_those_of_the_table() -> None:
     network: Any = create_network("impulse_posenet", layers=9).eval()
     shapes: list[tuple[str, tuple[int, ...]]] = []

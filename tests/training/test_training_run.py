@@ -341,6 +341,7 @@ def test_two_data_sets_are_learnt_from_as_one(made: Path, other: Path) -> None:
     assert joined.about["digest"] != material_of(message, [other, made], render=False).about["digest"]
 
 
+@pytest.mark.thorough
 def test_a_motion_in_training_of_one_set_and_validation_of_another_is_told(made: Path, tmp_path: Path) -> None:
     """Two models of one recipe: a shorter set has the same sequences, but they are divided anew."""
     for name, sequences in (("short", 14), ("whole", None)):
@@ -369,6 +370,7 @@ def test_rendering_is_not_resumed_with_other_validation_samples(made: Path, tmp_
     assert about[0]["digest"] != about[1]["digest"]
 
 
+@pytest.mark.thorough
 def test_a_network_of_two_models_names_both(made: Path, other: Path, tmp_path: Path) -> None:
     stored = train(TrainOptions(recipe(steps=2), [made, other], tmp_path / "run", threads=1, workers=0))
     assert (stored.model, stored.data) == ("thesis and physical", "tiny and other")
@@ -383,6 +385,7 @@ def test_a_network_of_two_models_names_both(made: Path, other: Path, tmp_path: P
         train(TrainOptions(recipe(steps=2), made, tmp_path / "run", resume=True, threads=1, workers=0))
 
 
+@pytest.mark.thorough
 def test_data_sets_that_cannot_be_joined_are_refused(made: Path, tmp_path: Path) -> None:
     wider = tmp_path / "wider.zarr"
     make_dataset(tiny_recipe(scenes=[{"count": 2, "sequences": 5}], sonar__beams=14), str(wider))
@@ -399,6 +402,7 @@ def numbers_of(validation: Validation) -> list[int]:
     return numbers
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["image", "vector"])
 def test_batches_in_the_memory_of_a_device_are_those_of_the_loader(kind: str, tmp_path: Path) -> None:
     """Bit for bit, in raw samples and in finished ones with noise; CPUs read, and so do frames with ground geometry."""
@@ -540,6 +544,7 @@ def test_the_network_kept_is_that_which_is_better_on_every_axis_alike() -> None:
     assert _score([message], np.zeros(3)) == pytest.approx(message.mean())
 
 
+@pytest.mark.thorough
 def test_a_run_keeps_what_it_promises(
     made: Path, tmp_path: Path, bare_curves: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -591,6 +596,7 @@ def test_a_stop_leaves_a_network_and_a_row_of_the_log(made: Path, tmp_path: Path
     assert train(TrainOptions(message, made, tmp_path / "run", resume=True, minutes=5)).trained["steps"] == 3
 
 
+@pytest.mark.thorough
 def test_runs_that_are_there_are_kept(made: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     message = recipe(steps=2)

@@ -59,6 +59,7 @@ TEXTS = {
 """Texts that took seconds to hours, or gigabytes, and what is said of them."""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", TEXTS)
 def test_texts_are_checked_in_linear_time(name: str, tmp_path: Path) -> None:
     """Quadratic time would be hours; seconds on a quiet machine are a minute on a busy one."""
@@ -187,6 +188,7 @@ for name in json.loads(sys.argv[1]):
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.linux
 def test_scenes_whose_files_are_none_are_refused_at_once(tmp_path: Path) -> None:
     """Each within a second and a GiB."""

@@ -233,6 +233,7 @@ def test_includes_in_a_circle_and_links_out_of_the_folder_are_refused(tmp_path: 
         imported_world(tmp_path / "harbour.sdf")
 
 
+@pytest.mark.thorough
 def test_files_that_include_each_other_many_times_are_refused(tmp_path: Path) -> None:
     for number in range(12):
         inner = "".join(f"<include><uri>{number + 1}.sdf</uri><name>m{k}</name></include>" for k in range(10))

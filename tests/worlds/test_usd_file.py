@@ -42,6 +42,7 @@ def test_prims_are_placed_scaled_and_coloured(tmp_path: Path) -> None:
     assert {shape.id() for shape in load_scene(world.write(tmp_path / "w")).shapes()} == {"/World/ball", "/World/plate"}
 
 
+@pytest.mark.thorough
 def test_planes_have_the_extent_that_usd_gives_them(tmp_path: Path) -> None:
     """Width and length of a plane lie along other axes for each of its normals."""
     from pxr import Usd, UsdGeom
@@ -59,6 +60,7 @@ def test_planes_have_the_extent_that_usd_gives_them(tmp_path: Path) -> None:
         np.testing.assert_allclose(box_of(tmp_path / "planes.usda", f"/{axis}"), extent, atol=1e-9)
 
 
+@pytest.mark.thorough
 def test_stages_with_y_up_stand_upright_and_collision_shapes_may_be_hidden(tmp_path: Path) -> None:
     upright = USDA.replace('upAxis = "Z"', 'upAxis = "Y"').replace("rotateZ = 90", "rotateZ = 0")
     (tmp_path / "stage.usda").write_text(upright.replace("(200, 0, 0)", "(200, 100, 0)"))

@@ -90,6 +90,7 @@ def test_waves_travel_with_the_wind_at_their_speed(depth: float) -> None:
         assert -np.angle(cross[row, 0]) / time == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.thorough
 def test_two_times_of_a_sea_are_correlated_as_its_spectrum_says() -> None:
     """The mean product is the integral of S cos(omega t); the same time has the same heights."""
     spectrum, count, seeds = pierson_moskowitz(3.0), 121, 24

@@ -236,6 +236,7 @@ def test_tubes_and_anodes_follow_their_definition() -> None:
     is_uniform(extents(anodes)[:, 2], 0, 0.03)
 
 
+@pytest.mark.thorough
 def test_flat_objects_follow_their_definition() -> None:
     """Almanza-Medina, 5.4.1; tops of overlapping objects differ, or the ray tracer would see now one, now the other."""
     counts = []

@@ -130,6 +130,7 @@ def test_slopes_are_those_of_differences() -> None:
         assert error < (0.05 if number != 2 else 0.2), f"number {number}: {error:.3f}"
 
 
+@pytest.mark.thorough
 def test_law_is_the_same_for_receivers_of_one_kind() -> None:
     """What is computed for a look forward serves the other three, turned."""
     motion = np.array([0.02, -0.012, 0.0, 0.0])
@@ -244,6 +245,7 @@ def test_limit_is_the_same_forward_and_sideways() -> None:
     np.testing.assert_allclose(one, two[::-1], rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_turns_show_where_receivers_sit_beside_their_look() -> None:
     """On a lever across the look a turn moves the receiver along it; on a lever along the look it hardly shows."""
     turned = [(0.3, 0.0, 0.0), (0.0, 0.3, 0.0), (-0.3, 0.0, 0.0), (0.0, -0.3, 0.0)]

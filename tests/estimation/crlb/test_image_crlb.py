@@ -504,6 +504,7 @@ def test_segments_and_their_sums() -> None:
 SCENE = floor_scene('<texture type="cell_noise" name="reflectance"><integer name="cells" value="2000"/></texture>')
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("variant")
 def test_the_command_answers_the_buyer(tmp_path: Path) -> None:
     """Twice the height: cells twice as far apart, larger errors; no noise: no exact bound, and words that say so."""

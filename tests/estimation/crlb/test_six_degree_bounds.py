@@ -105,6 +105,7 @@ def test_the_same_sonar_on_a_vehicle_has_the_same_derivatives() -> None:
     np.testing.assert_allclose(same.jacobian, alone.jacobian, atol=1e-3 * float(scale.max()))
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("variant")
 def test_three_of_six_have_the_information_of_three() -> None:
     source = simulator(SONAR, floor=floor(diffuse(blotches()), 10))
@@ -183,6 +184,7 @@ def test_steps_are_balanced() -> None:
 # ---------------------------------------------------------------- instruments of several fans
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("variant")
 def test_information_of_fans_adds_up() -> None:
     fan = SONAR.replace(model="physical", beams=8, rays_per_beam=100)
@@ -239,6 +241,7 @@ def test_speckle_has_bounds_of_six_degrees() -> None:
 CHANNEL, HEIGHT = ChannelSonar(), 10.0
 
 
+@pytest.mark.thorough
 def test_pitch_and_roll_of_receivers_a_quarter_turn_apart() -> None:
     """Turned by 90 deg the motion changes its axes, and pitch and roll change places."""
     one, two = (
@@ -248,6 +251,7 @@ def test_pitch_and_roll_of_receivers_a_quarter_turn_apart() -> None:
     np.testing.assert_allclose(one.std()[[0, 1, 2, 3, 4, 5]], two.std()[[1, 0, 2, 4, 3, 5]], rtol=1e-3)
 
 
+@pytest.mark.thorough
 def test_named_degrees_are_the_parameters_of_the_information() -> None:
     motion = [0.01, 0.02, 0.001, 0.0, 0.0, 0.0005]
     named = channel_bound(CHANNEL, HEIGHT, motion, ("yaw", "sideways"), snr_db=20.0)
@@ -278,6 +282,7 @@ def test_a_small_pitch_lifts_a_receiver_on_a_long_lever_only() -> None:
     np.testing.assert_allclose(tilted.amplitude, level.amplitude, rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_scores_of_drawn_responses_have_the_information_of_pitch_and_roll() -> None:
     """Monte Carlo: responses drawn by the covariance of two pings; their scores covary as the information says."""
     from mitsonar.estimation.channel.covariance import block_toeplitz
@@ -320,6 +325,7 @@ range_bins: 32
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("variant")
 def test_the_command_names_what_cannot_be_observed(tmp_path: Path) -> None:
     path, fans, picture = tmp_path / "floor.xml", tmp_path / "fans.yaml", tmp_path / "six.png"

@@ -290,6 +290,7 @@ def test_a_network_of_torch_is_an_estimator(ground: NDArray[np.float64]) -> None
         create_estimator(torch.nn.Identity()).estimate(frames)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("mine")
 def test_a_worker_imports_the_class_again(ground: NDArray[np.float64], tmp_path: Path) -> None:
     """Its search path lacks the folder of the module, as that of the installed command does."""

@@ -63,6 +63,7 @@ def off(found: Estimate, motion: Motion) -> NDArray[np.float64]:
     return np.asarray(np.abs(np.array(found.motion) - np.array(motion)) * UNITS, dtype=np.float64)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize("method", METHODS)
 def test_far_motions_are_found_without_a_prior(far: SonarFrames, method: str) -> None:
@@ -114,6 +115,7 @@ def test_a_near_motion_with_a_prior_is_that_without(rocks: Simulator) -> None:
     assert (off(message, alone.motion) < [0.1, 0.1, 0.003]).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("variant")
 def test_swapped_far_frames_tell_the_opposite_motion(far: SonarFrames) -> None:
     """Two ways to one number: relief is drawn in the first frame, and the way back has another first frame."""

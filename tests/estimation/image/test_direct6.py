@@ -72,6 +72,7 @@ def test_means_of_noisy_pixels_are_those_of_draws() -> None:
             assert abs(drawn.mean() - expected) < tolerance, (noise, level)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("variant")
 def test_a_pose_and_a_motion_come_back() -> None:
     simulator, gain = source()
@@ -105,6 +106,7 @@ def test_errors_are_those_of_the_bound() -> None:
     assert (least < 0.4 * START.of(SIX)).all()  # the assumed pose hardly helps
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("variant")
 def test_what_a_frame_does_not_show_stays_as_assumed() -> None:
     """Over an even floor: height and attitude are found, position and heading keep their assumed values and variances."""
@@ -129,6 +131,7 @@ def test_information_within_its_noise_counts_for_nothing() -> None:
     np.testing.assert_allclose(covariance, np.diag(expected))
 
 
+@pytest.mark.thorough
 def test_frames_of_another_place_and_wrong_arguments_are_refused() -> None:
     simulator, gain = source()
     estimator = Direct6(simulator, gain, LOW, START, pings=4)

@@ -130,6 +130,7 @@ def test_a_shadow_moves_across_the_beams_as_what_casts_it() -> None:
     np.testing.assert_allclose(turned[rows, 47:49].mean(axis=1), -turn_rad * x_m / floor, rtol=0.01)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("step_m", "remains"), [(0.04, 0.7), (0.1, 0.2)])
 def test_shadows_do_not_turn_a_sideways_motion(step_m: float, remains: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Posts all over three floors: displaced as the floor, their shadows turn the motion by 0.3 deg a metre or more."""

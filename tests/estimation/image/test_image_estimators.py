@@ -198,6 +198,7 @@ def test_swapped_frames_tell_the_opposite_motion(pair: Pair) -> None:
 # ---------------------------------------------------------------- nothing to believe
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", METHODS)
 def test_nothing_to_match_is_not_believed(pair: Pair, simulator: Simulator, method: str) -> None:
     """A blank frame, noise alone, frames of two different places."""

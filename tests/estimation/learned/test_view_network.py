@@ -288,6 +288,7 @@ SMALL: dict[str, Any] = {
 }
 
 
+@pytest.mark.thorough
 def test_a_network_of_vectors_learns_and_is_evaluated(portions: Path, tmp_path: Path, mitsonar: Command) -> None:
     recipe = training_recipe_from({**SMALL, "input": {"kind": "vector", "range_levels": 20}})
     stored = train(TrainOptions(recipe, portions, tmp_path / "run"))
@@ -389,6 +390,7 @@ def learnt(portions: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("noise", essence(["none", "high"], "high"))
 def test_a_network_of_views_drives_a_path(
     portions: Path, learnt: Path, tmp_path: Path, mitsonar: Command, noise: str
