@@ -224,7 +224,7 @@ def mosaic(
     ] = True,
     true: Annotated[Path | None, typer.Option(help="TUM or CSV file of the true path, to draw as well.")] = None,
     frame: Frame = "mitsonar",
-    height: Annotated[float | None, typer.Option(help="Height over the ground [m], for frames that lack it.")] = None,
+    height: Annotated[float | None, typer.Option(help="Mean height over the ground [m], for frames that lack it.")] = None,
     pitch_deg: Annotated[float | None, typer.Option(help="Pitch [deg], > 0 is down, for frames without poses.")] = None,
     sequence: Annotated[int | None, typer.Option(help="Sequence of a data set (default: the longest).")] = None,
     view: Annotated[
@@ -291,6 +291,8 @@ def mosaic(
     heights = source.heights_along(index, poses)
     if heights is None:
         raise MitsonarError(f"{source.name} holds no height over the ground: give --height")
+    if source.height_m is not None and np.ptp(source.height_m[index]) == 0 < np.ptp(heights):
+        say(f"height over level ground, by the heave of the path: {heights.min():.4g} to {heights.max():.4g} m")
     light = None
     if flatten:
         some = np.unique(np.linspace(0, len(index) - 1, min(ILLUMINATION_FRAMES, len(index))).astype(np.intp))

@@ -366,18 +366,21 @@ class OwnEstimator:
             raise MitsonarError(f"{self.path}: estimate raises {_words_of(error)} at {location}") from error
         try:
             motion = Motion(*(float(value) for value in estimate.motion))
-            covariance = None if estimate.covariance is None else self._covariance(estimate.covariance)
+            covariance = None if estimate.covariance is None else self._covariance(estimate.covariance, bool(estimate.valid))
             return Estimate(motion, covariance, bool(estimate.valid), str(estimate.reason), estimate.about)
         except (AttributeError, TypeError):
             raise MitsonarError(f"{self.path}: estimate must return an Estimate: got {type(estimate).__name__}") from None
 
-    def _covariance(self, values: AnyObject) -> NDArray[np.float64]:
-        """Return a covariance as an array of 3 x 3, checked for variances above 0 and correlations below 1."""
+    def _covariance(self, values: AnyObject, valid: bool) -> NDArray[np.float64]:
+        """Return a covariance as an array of 3 x 3, positive definite if the motion is valid."""
         covariance = np.asarray(values, dtype=np.float64)
         if covariance.shape != (3, 3):
             raise MitsonarError(f"{self.path}: the covariance of an Estimate must be 3 x 3 or None: got {covariance.shape}")
-        variances = np.diag(covariance)
-        if not (np.isfinite(covariance).all() and (variances > 0).all() and np.allclose(covariance, covariance.T)):
+        if not valid:  # nothing uses it
+            return covariance
+        variances, largest = np.diag(covariance), np.abs(covariance).max()
+        plausible = np.isfinite(largest) and (variances > 0).all()
+        if not plausible or not np.allclose(covariance, covariance.T, atol=1e-9 * largest):
             got = ", ".join(f"{one:.3g}" for one in variances)
             raise MitsonarError(
                 f"{self.path}: the covariance of an Estimate must be finite and symmetric, with variances above 0: got "

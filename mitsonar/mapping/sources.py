@@ -429,12 +429,22 @@ class FrameSource:
         Args:
             index: numbers of the frames ``(n,)``.
             poses: poses of the path at these frames ``(n, 6)`` [m, rad].
+
+        Raises:
+            MitsonarError: the path falls below level ground.
         """
         if self.height_m is None:
             return None
         heights = self.height_m[index]
-        guess = self.assumed_height or self.given_height_m is not None
-        return heights + poses[:, 2] - poses[:, 2].mean() if guess and len(heights) and np.ptp(heights) == 0 else heights
+        if not (self.assumed_height or self.given_height_m is not None) or np.ptp(heights) > 0:
+            return heights
+        heave = poses[:, 2] - poses[:, 2].mean()
+        if (heights + heave <= 0).any():
+            raise MitsonarError(
+                f"{self.name}: the path heaves by {heave.min():.4g}..{heave.max():.4g} m about its mean, more than the "
+                f"height of {heights[0]:g} m over level ground: give the mean height, and the heights of the path in metres"
+            )
+        return np.asarray(heights + heave, dtype=np.float64)
 
     @property
     def frames_per_chunk(self) -> int:

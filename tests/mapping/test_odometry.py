@@ -448,6 +448,9 @@ def test_a_given_height_is_the_mean_over_a_path_that_heaves() -> None:
     assert source.heights_along(index, path[index]) is None
     heights = source.with_geometry(2.0).heights_along(index, path[index])
     np.testing.assert_allclose(heights, 2.0 + np.array([0.1, 0.2, 0.1]) - 0.4 / 3)  # type: ignore[arg-type]
+    path[:, 2] *= 1000  # in millimetres
+    with pytest.raises(MitsonarError, match=r"heaves by -33\.33\.\.66\.67 m about its mean, more than the height of 2 m"):
+        source.with_geometry(2.0).heights_along(index, path[index])
     measured = replace(source, height_m=np.full(5, 2.0))
     np.testing.assert_array_equal(measured.heights_along(index, path[index]), 2.0)
 

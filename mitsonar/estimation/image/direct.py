@@ -607,12 +607,12 @@ class _ReliefLevel:
             weight = cauchy(side.after - side.before, side.scale)
             weight *= np.float32(0.25) * (2 * weight - 1) * side.inside
             frames, middle = (side.before, side.after), (side.before + side.after) * np.float32(0.5)
+            products = np.zeros((len(PAIRS), *self.shape), np.float32)
             for used, seen in (frames, frames[::-1]):
                 slopes = slopes_of(used, self.level, side.scale, like=middle), central_differences(seen)
                 one, other = (by[0] * derivatives[:, 0] + by[1] * derivatives[:, 1] for by in slopes)
-                one *= weight
-                total += self._sums(side, [(one[k], other[right]) for k, right in PAIRS])
-                total += self._sums(side, [(one[right], other[k]) for k, right in PAIRS])
+                products += [one[k] * other[right] + one[right] * other[k] for k, right in PAIRS]
+            total += self._sums(side, [(weight, product) for product in products])
         # a block whose height the frames do not share keeps its prior height
         shared = total[9] > 0
         normal = total[[0, 1, 2, 1, 4, 5, 2, 5, 7]].reshape(3, 3, -1)

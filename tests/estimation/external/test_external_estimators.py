@@ -194,6 +194,7 @@ def test_a_class_of_the_users_own_is_an_estimator(ground: NDArray[np.float64]) -
         (np.diag([1e-6, -1e-6, 1e-8]), "variances above 0: got variances 1e-06, -1e-06, 1e-08"),
         (np.diag([1e-6, np.nan, 1e-8]), "finite and symmetric"),
         (np.array([[1.0, 0.5, 0.0], [0.1, 1.0, 0.0], [0.0, 0.0, 1.0]]), "symmetric"),
+        (np.diag([1e-6, 1e-6, 1e-9]) + 5e-10 * np.eye(3)[[2, 1, 0]] * [0, 0, 1], "symmetric"),
         (1e-8 * np.ones((3, 3)), "positive definite: components depend on each other"),
     ],
 )
@@ -201,11 +202,17 @@ def test_a_covariance_that_is_none_is_one_sentence(
     covariance: NDArray[np.float64], reason: str, ground: NDArray[np.float64]
 ) -> None:
     class Odd:
-        def estimate(self, frames: SonarFrames) -> Estimate:
-            return Estimate(Motion(0.0, 0.0, 0.0), covariance)
+        def __init__(self, valid: bool) -> None:
+            self.valid = valid
 
+        def estimate(self, frames: SonarFrames) -> Estimate:
+            return Estimate(Motion(0.0, 0.0, 0.0), covariance, self.valid)
+
+    frames = pair(ground, Motion(0.0, 0.0, 0.0))
     with pytest.raises(MitsonarError, match=reason):
-        create_estimator(Odd()).estimate(pair(ground, Motion(0.0, 0.0, 0.0)))
+        create_estimator(Odd(valid=True)).estimate(frames)
+    if covariance.shape == (3, 3):  # of a rejected motion, which nothing uses
+        assert not create_estimator(Odd(valid=False)).estimate(frames).valid
 
 
 @pytest.mark.usefixtures("mine")
