@@ -21,6 +21,8 @@ __all__ = [
     "count_noun",
     "did_you_mean",
     "missing_package_error",
+    "one_line",
+    "printable",
     "short_repr",
     "suggest_names",
     "validation_message",
@@ -61,6 +63,16 @@ ARGUMENT_DELIMITER = "\x1f"
 """Control character that delimits argument names in messages; never displayed."""
 
 
+def one_line(text: str) -> str:
+    """Return a text as one line of printable characters: names in files may contain line breaks."""
+    return printable(re.sub(r"\s*[\n\r\v\f\x85\u2028\u2029]\s*", " ", text.strip()))
+
+
+def printable(text: str) -> str:
+    """Return a text with escapes, such as ``\\x1b``, for all characters that would control a terminal, but line breaks."""
+    return "".join(one if one.isprintable() or one == "\n" else repr(one)[1:-1] for one in text)
+
+
 class MitsonarError(ValueError):
     """Error caused by invalid or unusable input. The command line prints the message and exits with code 2."""
 
@@ -68,7 +80,7 @@ class MitsonarError(ValueError):
         return self.with_options({})
 
     def with_options(self, options: Mapping[str, str]) -> str:
-        """Return the message with the names of marked arguments replaced by command-line options.
+        """Return the message as one line, with the names of marked arguments replaced by command-line options.
 
         Args:
             options: command-line options, keyed by the argument that :func:`mitsonar.errors.argument` marks, such as
@@ -78,7 +90,8 @@ class MitsonarError(ValueError):
         def option_of(match: re.Match[str]) -> str:
             return options.get(match[1].rpartition(" ")[2], match[1])
 
-        return re.sub(f"{ARGUMENT_DELIMITER}([^{ARGUMENT_DELIMITER}]*){ARGUMENT_DELIMITER}", option_of, super().__str__())
+        marked = f"{ARGUMENT_DELIMITER}([^{ARGUMENT_DELIMITER}]*){ARGUMENT_DELIMITER}"
+        return one_line(re.sub(marked, option_of, super().__str__()))
 
 
 def argument(name: str) -> str:

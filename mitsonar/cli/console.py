@@ -23,7 +23,7 @@ from typing import ParamSpec, Protocol, TypeVar
 import typer
 from rich.markup import escape
 
-from mitsonar.errors import MitsonarError, MitsonarWarning, missing_package_error
+from mitsonar.errors import MitsonarError, MitsonarWarning, missing_package_error, one_line, printable
 
 __all__ = [
     "LaterBar",
@@ -47,7 +47,7 @@ R = TypeVar("R")
 
 def say(text: str) -> None:
     """Print a line on standard output."""
-    typer.echo(text)
+    typer.echo(printable(text))
 
 
 def say_json(value: object, indent: int = 2) -> None:
@@ -65,7 +65,7 @@ def _with_nulls(value: object) -> object:
 
 def warn(text: str) -> None:
     """Print a warning on standard error."""
-    typer.echo(f"warning: {text}", err=True)
+    typer.echo(f"warning: {one_line(text)}", err=True)
 
 
 class Terminated(KeyboardInterrupt):
@@ -153,6 +153,13 @@ OPTIONS: dict[str, dict[str, str]] = {
     "mesh": {"up": "--up", "scale": "--scale", "floor_m": "--floor-m", "reflectivity": "--reflectivity"},
     "import_scene": {"reflectivity": "--reflectivity", "seabed_z": "--seabed-z"},
     "reproduce": {"minutes": "--minutes"},
+    "show": {"height_m": "--height"},
+    "convert": {
+        **{name: f"--{name.replace('_', '-')}" for name in ("beams", "crop_bins", "crop_beams")},
+        "level_db": "--scan-db",
+        "from_m": "--scan-from",
+    },
+    "odometry_benchmark": {"frames": "--frames"},
 }
 """Option of an argument that a message names (:func:`mitsonar.errors.argument`), keyed by command."""
 
@@ -182,7 +189,7 @@ def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) 
             with _signals_stop():
                 return command(*args, **kwargs)
         except MitsonarError as error:
-            typer.echo(f"error: {' '.join(error.with_options(typed).split())}", err=True)
+            typer.echo(f"error: {error.with_options(typed)}", err=True)
         except ModuleNotFoundError as error:
             typer.echo(f"error: {missing_package_error(error)}", err=True)
         except BrokenPipeError:  # the reader of our output has ended, which is no error

@@ -708,10 +708,11 @@ def compare(
 def benchmarks() -> typer.Typer:
     """Create the group of commands."""
     app = typer.Typer(help="Compare methods on reproducible sets.", no_args_is_help=True)
-    app.command("odometry")(answered(odometry_benchmark, {"frames": "--frames"}))
+    app.command("odometry")(odometry_benchmark)
     return app
 
 
+@answered
 def odometry_benchmark(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to make: table.md, table.json, rows.jsonl, sets, paths.")],
     set_: Annotated[

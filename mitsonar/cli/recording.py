@@ -84,21 +84,7 @@ Labels = Annotated[bool, typer.Option("--labels", help="Outline labelled objects
 def recordings() -> typer.Typer:
     """Create the group of commands."""
     app = typer.Typer(help="Show and convert recordings of real sonars, and runs.", no_args_is_help=True)
-    for command in (
-        info,
-        answered(show, {"height_m": "--height"}),
-        video,
-        answered(
-            convert,
-            {
-                "beams": "--beams",
-                "crop_bins": "--crop-bins",
-                "crop_beams": "--crop-beams",
-                "level_db": "--scan-db",
-                "from_m": "--scan-from",
-            },
-        ),
-    ):
+    for command in (info, show, video, convert):
         app.command()(command)
     return app
 
@@ -153,6 +139,7 @@ def info(
         )
 
 
+@answered
 def show(
     file: File,
     out: Annotated[Path, typer.Option("-o", "--out", help="PNG to write.")],
@@ -245,6 +232,7 @@ def video(
     say(f"{count_noun(count, 'frame')} at {speed:.4g} a second in {out}")
 
 
+@answered
 def convert(
     file: File,
     out: Annotated[

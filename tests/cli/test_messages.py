@@ -19,7 +19,7 @@ import typer
 from drawn_frames import over_ground, sway
 from helpers import Command, essence, refused, run_python
 
-from mitsonar.cli.console import OPTIONS, _Log, answered, command_line, say_json
+from mitsonar.cli.console import OPTIONS, _Log, answered, command_line, say, say_json, warn
 from mitsonar.errors import MitsonarError, argument, did_you_mean
 from mitsonar.geometry.ground import attitude_of
 
@@ -150,6 +150,16 @@ def test_arguments_have_their_python_names_but_for_who_typed_options() -> None:
         assert one.with_options({"pitch_rad": "--pitch-deg"}) == "give height_m or --pitch-deg, not height_m"
 
 
+GROUPED = {
+    "mesh": "world mesh",
+    "import_scene": "world import",
+    "show": "recording show",
+    "convert": "recording convert",
+    "odometry_benchmark": "benchmark odometry",
+}
+"""Functions of the table whose commands are in a group, or are called otherwise."""
+
+
 def test_the_table_names_options_that_there_are() -> None:
     """Every option of the table is one of its command."""
     import typer
@@ -158,8 +168,9 @@ def test_the_table_names_options_that_there_are() -> None:
 
     tree: Any = typer.main.get_command(application())
     for name, options in OPTIONS.items():
-        world = {"mesh": "mesh", "import_scene": "import"}.get(name)
-        command = tree.commands[name] if world is None else tree.commands["world"].get_command(None, world)
+        command = tree
+        for word in GROUPED.get(name, name).split():
+            command = command.get_command(None, word)
         there = {option for parameter in command.params for option in parameter.opts}
         assert {option for option in options.values() if option.startswith("--")} <= there, name
 
@@ -307,3 +318,13 @@ def test_the_time_left_is_estimated_from_the_third_item(capsys: pytest.CaptureFi
     lines = capsys.readouterr().err.splitlines()
     assert [line.rpartition(", ")[2].endswith("s left") for line in lines] == [False, False, True, True]
     assert lines[-1].endswith(" 0 s left")
+
+
+def test_names_from_files_cannot_break_a_message_or_control_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """As read in a damaged bag: a line break, an escape sequence and an undecodable byte within names."""
+    hostile = "/topic\n (\x1b[2J\x07 \udcff)"
+    assert str(MitsonarError(f"no  topic {hostile}\n")) == r"no  topic /topic (\x1b[2J\x07 \udcff)"
+    warn(hostile)
+    say("facts\nof \x1b[31m")
+    shown = capsys.readouterr()
+    assert (shown.out, shown.err) == ("facts\nof \\x1b[31m\n", "warning: /topic (\\x1b[2J\\x07 \\udcff)\n")
