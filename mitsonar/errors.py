@@ -69,7 +69,7 @@ def one_line(text: str) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text with escapes, such as ``\\x1b``, for all characters that would control a terminal, but line breaks."""
+    """Return a text with escapes in place of all characters that would control a terminal, except line breaks."""
     return "".join(one if one.isprintable() or one == "\n" else repr(one)[1:-1] for one in text)
 
 
