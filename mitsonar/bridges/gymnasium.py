@@ -19,7 +19,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from mitsonar.acoustics.noise import NoiseModel, refuse_noise
-from mitsonar.errors import MitsonarError, MitsonarWarning, argument, check_argument_names, suggest_names
+from mitsonar.errors import MitsonarError, MitsonarWarning, argument, check_argument_names, short_repr, suggest_names
 from mitsonar.geometry.fan import CartesianMap, cartesian_map
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
@@ -198,7 +198,7 @@ class SonarFleet:
             MitsonarError: the actions have a wrong shape, or are not finite.
         """
         # 1. Move all vehicles, and put those with a new episode at its start.
-        actions = np.asarray(action, dtype=float)
+        actions = _numbers_of(action)
         if actions.shape != (len(self.poses), 4) or not np.isfinite(actions).all():
             raise MitsonarError(
                 f"an action must be four finite numbers for each of {len(self.poses)}: got {_fault_of(actions)}"
@@ -230,6 +230,18 @@ class SonarFleet:
                 f"reward must return {len(self.poses)} finite numbers, or one for all: got {_fault_of(rewards)}"
             )
         return np.array(np.broadcast_to(rewards, len(self.poses)))
+
+
+def _numbers_of(action: ArrayLike) -> Table:
+    """Return actions as numbers.
+
+    Raises:
+        MitsonarError: they are not numbers, or ragged.
+    """
+    try:
+        return np.asarray(action, dtype=float)
+    except (TypeError, ValueError):
+        raise MitsonarError(f"an action must be four finite numbers: got {short_repr(action)}") from None
 
 
 def _fault_of(values: Table) -> str:
@@ -361,7 +373,7 @@ class SonarEnv(gymnasium.Env[Observation, Array]):
         if self._image is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         fleet = self.fleet
-        transition = fleet.advance(np.asarray(action, dtype=float)[None], np.array([False]), [self.np_random])
+        transition = fleet.advance(_numbers_of(action)[None], np.array([False]), [self.np_random])
         self._image = transition.image[0]
         info = {
             "pose": transition.poses[0].copy(),

@@ -335,7 +335,7 @@ def _empty_frames(head: Header, bearings: Array, time_s: Array, images: OculusIm
         frequency_hz=frequency if 1e4 < frequency < 1e8 else None,
         frame_rate_hz=_rate(time_s),
         coding="gamma",
-        coding_gamma=_gamma(int(first["gamma"])),
+        coding_gamma=gamma_exponent(int(first["gamma"])),
     )
     return SonarFrames(
         image=np.zeros((0, bins, beams), np.uint8 if images.eight_bit else np.float32),
@@ -362,7 +362,7 @@ def _beam_layout(bearings: Array) -> tuple[str, float]:
     return "sine", 2 * math.degrees(math.asin(min(1.0, half)))
 
 
-def _gamma(code: int) -> float:
+def gamma_exponent(code: float) -> float:
     """Return the exponent encoded by a gamma byte: 1 for 0 and 255, otherwise the byte divided by 254 (127 is 0.5)."""
     return 1.0 if code in (0, 255) else code / 254
 
@@ -412,7 +412,7 @@ def _notes(head: Header) -> list[str]:
     codes = [int(code) for code in np.unique(head["gamma"]) if code not in (0, 127, 255)]
     if codes:
         notes.append(
-            f"the gamma byte {codes[0]} is interpreted as the exponent {_gamma(codes[0]):.3g}: only 0, 127 and 255 are known"
+            f"the gamma byte {codes[0]} is interpreted as the exponent {gamma_exponent(codes[0]):.3g}: only 0, 127 and 255 are known"
         )
     if not ((head["sound_speed"] > 1000) & (head["sound_speed"] < 2000)).any():
         notes.append("the messages hold no plausible sound speed: 1500 m/s is assumed; ranges do not depend on it")

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mitsonar.recordings.oculus import gamma_exponent
 from mitsonar.recordings.ros_messages import DTYPES, PROJECTED, RAW, Message
 
 __all__ = ["SONAR_AXES_IN_FLU", "PingLayout", "decode_image", "is_beam_major", "parse_layout", "samples_of"]
@@ -251,7 +252,6 @@ def _oculus(message: Message) -> PingLayout:
     if not (0 < step < 100 and 0 < bins < 2**16):
         raise ValueError("invalid range resolution or number of ranges")
     fire = message.fire_msg
-    gamma = float(fire.gamma)
     return PingLayout(
         range_m=np.asarray((np.arange(bins) + 0.5) * step, dtype=np.float64),
         bearing_rad=bearing[order],
@@ -261,7 +261,7 @@ def _oculus(message: Message) -> PingLayout:
         frame_id=str(message.header.frame_id),
         frequency_hz=_positive_or_zero(getattr(message, "frequency", 0.0)),
         sound_speed=_positive_or_zero(getattr(message, "speed_of_sound", 0.0)) or _positive_or_zero(fire.speed_of_sound),
-        gamma=gamma / 255 if 0 < gamma < 255 else 1.0,
+        gamma=gamma_exponent(int(fire.gamma)),
     )
 
 

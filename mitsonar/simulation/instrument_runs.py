@@ -22,7 +22,7 @@ from mitsonar.instruments.hydrophones import ChannelSonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import Sounder
 from mitsonar.io.files import read_npz, write_atomic
-from mitsonar.io.runs import RunDirectory, RunKind, digest
+from mitsonar.io.runs import RUN_FILE, RunDirectory, RunKind, digest
 from mitsonar.io.storage import refuse_codecs
 from mitsonar.motion.bodies import MovingBodies
 from mitsonar.motion.sensors import save_sensors
@@ -562,6 +562,12 @@ def run_vehicle(
     """
     sensors, bodies = simulator.sensors(vehicle), simulator.bodies(vehicle)
     refuse_path(sensors, vehicle, options.noise)
+    others = [one.parent.name for one in destination.folder.glob(f"*/{RUN_FILE}") if one.parent.name not in sensors]
+    if destination.overwrite and others:
+        raise MitsonarError(
+            f"{destination.folder} contains runs that this run does not replace, {', '.join(sorted(others))}: remove their "
+            "folders, or choose another -o"
+        )
     settings = {
         "sensors": {name: _sensor_settings(one) for name, one in sensors.items()},
         "frame": options.frame,

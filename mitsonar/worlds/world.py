@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -363,7 +364,7 @@ class World:
         """Return the XML of the Mitsuba scene."""
         shapes: Iterable[Floor | Mesh] = [*([self.floor] if self.floor else []), *self.meshes]
         shapes = [*shapes, *([self.surface] if self.surface else [])]
-        about = escape(self.about).replace("--", "- -")
+        about = re.sub("-(?=-)", "- ", escape(self.about))  # two hyphens would end the comment
         return f"""<?xml version="1.0" encoding="utf-8"?>
 <!-- {about} -->
 <scene version="3.0.0">

@@ -118,6 +118,9 @@ def test_a_run_goes_on_with_the_same_bits(tank: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(down.range_m.ravel(), 2.0, atol=0.08)
     with pytest.raises(MitsonarError, match="kept as it is"):
         run_vehicle(simulator, PATH, options, Destination(tmp_path / "run"))
+    fewer = VehicleSimulator(load_scene(tank), {"down": file.sensors["down"]}, moving={"fish": FISH})
+    with pytest.raises(MitsonarError, match="does not replace, ahead, camera: remove"):
+        run_vehicle(fewer, PATH, options, Destination(tmp_path / "run", overwrite=True))
 
 
 def test_motions_of_the_scene_and_of_a_file_are_the_same(tank: Path, tmp_path: Path) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -113,6 +115,14 @@ def test_the_current_folder_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(tmp_path)
     with pytest.raises(MitsonarError, match="kept as it is"):
         RockyField(size_m=3, a_side=(2, 2)).build(0).write(".")
+
+
+def test_hyphens_in_a_name_do_not_end_the_comment_of_a_scene() -> None:
+    world = RockyField(size_m=3, a_side=(2, 2)).build(0)
+    text = replace(world, about="wreck---x--y-").xml()
+    root = ElementTree.fromstring(text, ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True)))
+    assert root.tag == "scene"
+    assert "<!-- wreck- - -x- -y- -->" in text
 
 
 # ---------------------------------------------------------------- rocky field
