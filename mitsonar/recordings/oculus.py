@@ -412,7 +412,8 @@ def _notes(head: Header) -> list[str]:
     codes = [int(code) for code in np.unique(head["gamma"]) if code not in (0, 127, 255)]
     if codes:
         notes.append(
-            f"the gamma byte {codes[0]} is interpreted as the exponent {gamma_exponent(codes[0]):.3g}: only 0, 127 and 255 are known"
+            f"the gamma byte {codes[0]} is interpreted as the exponent {gamma_exponent(codes[0]):.3g}: "
+            "only 0, 127 and 255 are known"
         )
     if not ((head["sound_speed"] > 1000) & (head["sound_speed"] < 2000)).any():
         notes.append("the messages hold no plausible sound speed: 1500 m/s is assumed; ranges do not depend on it")
