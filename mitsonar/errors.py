@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import re
 import reprlib
 from collections.abc import Iterable, Mapping
@@ -58,6 +59,9 @@ EXTRAS = {
 
 MAX_KEY_LENGTH = 60
 """Maximum number of characters of a key in a message; keys in input files may be arbitrarily long."""
+
+MAX_LIST_LENGTH = 500
+"""Maximum number of characters of a list of names in a message."""
 
 ARGUMENT_DELIMITER = "\x1f"
 """Control character that delimits argument names in messages; never displayed."""
@@ -125,11 +129,18 @@ def missing_package_error(error: ModuleNotFoundError) -> MitsonarError:
 
 
 def suggest_names(wrong: str, names: Iterable[str]) -> str:
-    """Format the known names for the end of an error message, after a suggestion of those similar to ``wrong``."""
+    """Format the known names for the end of an error message, after a suggestion of those similar to ``wrong``.
+
+    Of many names the first are listed, and none if one is similar.
+    """
     known = list(names)
     similar = [name for name in known if wrong and wrong.lower() in name.lower()]
     similar = similar or difflib.get_close_matches(wrong.lower(), known, n=3, cutoff=0.5)
-    return f"did you mean {' or '.join(similar)}? Known: {', '.join(known)}" if similar else f"known: {', '.join(known)}"
+    lengths = itertools.accumulate(len(name) + 2 for name in known)
+    listed = ", ".join(name for name, length in zip(known, lengths, strict=True) if length <= MAX_LIST_LENGTH)
+    if listed != ", ".join(known):
+        listed = f"{len(known)} names" if similar else f"{listed}, ... ({len(known)} names)"
+    return f"did you mean {' or '.join(similar)}? Known: {listed}" if similar else f"known: {listed}"
 
 
 def count_noun(number: int, noun: str, plural: str = "") -> str:

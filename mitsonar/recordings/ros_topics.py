@@ -123,10 +123,18 @@ def motion_in(bag: BagFile, frame_id: str, axes: Array, time_s: Array) -> Motion
         frame_id: coordinate frame of the sonar's messages.
         axes: starboard, forward and up of the sonar in that frame, as columns ``(3, 3)``.
         time_s: frame times ``(frames,)`` [s].
+
+    Raises:
+        MitsonarError: messages cannot be read, or lack fields of their type: their definition is in the bag.
     """
     topics = [one for one in bag.topics() if one.messages]
-    others = _MotionSources(bag, topics, _transforms(bag, topics), _frame_name(frame_id), axes, time_s)
-    return replace(others.poses(), attitude_rad=others.attitude(), height_m=others.heights())
+    try:
+        others = _MotionSources(bag, topics, _transforms(bag, topics), _frame_name(frame_id), axes, time_s)
+        return replace(others.poses(), attitude_rad=others.attitude(), height_m=others.heights())
+    except MitsonarError:
+        raise
+    except (AttributeError, TypeError, ValueError) as error:
+        raise MitsonarError(f"{bag.path}: the definition of a message is damaged or of another version: {error}") from None
 
 
 def with_motion(part: Part, motion: Motion, places: Index) -> Part:
@@ -213,6 +221,8 @@ class _MotionSources:
         for _, raw in self.bag.messages(altimeters[0].name):
             message = self.bag.decode(raw, RANGE)
             numbers.extend((_seconds(message), float(message.range)))
+        if not numbers:
+            return None
         # Interpolate linearly, but only near a measurement. Implausible measurements become nan, and so do heights that
         # are interpolated from them.
         table = np.array(numbers).reshape(-1, 2)

@@ -20,7 +20,7 @@ from drawn_frames import over_ground, sway
 from helpers import Command, essence, refused, run_python
 
 from mitsonar.cli.console import OPTIONS, _Log, answered, command_line, say, say_json, warn
-from mitsonar.errors import MitsonarError, argument, did_you_mean
+from mitsonar.errors import MitsonarError, argument, did_you_mean, suggest_names
 from mitsonar.geometry.ground import attitude_of
 
 AMPHORA = Path(__file__).parents[1] / "scenes" / "meshes" / "amphora.ply"
@@ -328,3 +328,13 @@ def test_names_from_files_cannot_break_a_message_or_control_a_terminal(capsys: p
     say("facts\nof \x1b[31m")
     shown = capsys.readouterr()
     assert (shown.out, shown.err) == ("facts\nof \\x1b[31m\n", "warning: /topic (\\x1b[2J\\x07 \\udcff)\n")
+
+
+def test_of_many_names_the_nearest_or_the_first_are_listed() -> None:
+    """A sonar has more than 60 keys."""
+    assert suggest_names("c", ["ab", "cd"]) == "did you mean cd? Known: ab, cd"
+    many = [f"name_{number}" for number in range(100)]
+    assert suggest_names("name_77x", many).startswith("did you mean name_77 ")
+    assert suggest_names("name_77x", many).endswith("? Known: 100 names")
+    assert suggest_names("?", many).startswith("known: name_0, name_1, ")
+    assert suggest_names("?", many).endswith(", name_55, ... (100 names)")

@@ -148,6 +148,32 @@ def test_a_database_by_itself_and_without_definitions(tmp_path: Path) -> None:
         assert (open_recording(one).part().read([2]).image[0] == images[2]).all()
 
 
+def test_a_definition_that_lacks_a_field_is_named(tmp_path: Path) -> None:
+    """Bags of ROS 2 hold the definitions of their messages."""
+    fixed = Maker(False).transform(1.0, "base", "sonar", [0, 0, 0], [0, 0, 0, 1])
+    database = next(bag(tmp_path / "two", ("/tf_static", 1.0, fixed)).glob("*.db3"))
+    with contextlib.closing(sqlite3.connect(database)) as opened:
+        opened.execute(
+            "update message_definitions set encoded_message_definition = replace(encoded_message_definition, ?, ?)",
+            ("geometry_msgs/Quaternion rotation", "geometry_msgs/Quaternion rotatiom"),
+        )
+        opened.execute("update topics set type_description_hash = ''")
+        opened.commit()
+    with pytest.raises(MitsonarError, match=r"definition of a message is damaged or of another version: .*'rotation'"):
+        open_recording(database)
+
+
+def test_an_altimeter_whose_messages_are_lost_gives_no_heights(tmp_path: Path) -> None:
+    """The metadata of the bag count one."""
+    maker, limits = Maker(False), {"field_of_view": 0.1, "min_range": 0.1, "max_range": 50.0, "range": 3.0}
+    height = maker.make("sensor_msgs/Range", header=maker.header(1.0), radiation_type=0, **limits)
+    path = bag(tmp_path / "two", ("/altitude", 1.0, height))
+    with contextlib.closing(sqlite3.connect(next(path.glob("*.db3")))) as opened:
+        opened.execute("delete from messages where topic_id in (select id from topics where name = '/altitude')")
+        opened.commit()
+    assert open_recording(path).part().height_m is None
+
+
 @pytest.mark.parametrize("packing", ["BZ2", "LZ4"])
 def test_packed_bags_of_ros_1(tmp_path: Path, packing: str) -> None:
     maker, writer = Maker(True), Writer(tmp_path / "a.bag")
