@@ -562,7 +562,7 @@ def run_vehicle(
     """
     sensors, bodies = simulator.sensors(vehicle), simulator.bodies(vehicle)
     refuse_path(sensors, vehicle, options.noise)
-    others = [one.parent.name for one in destination.folder.glob(f"*/{RUN_FILE}") if one.parent.name not in sensors]
+    others = [one.parent.name for one in Path(destination.folder).glob(f"*/{RUN_FILE}") if one.parent.name not in sensors]
     if destination.overwrite and others:
         raise MitsonarError(
             f"{destination.folder} contains runs that this run does not replace, {', '.join(sorted(others))}: remove their "

@@ -99,7 +99,7 @@ def test_masked_resets_and_wrong_arguments(simulator: Simulator) -> None:
         env.step(np.full((2, 4), np.nan))
     for wrong_action in ("left", [[0, 1], [0]], [["x"] * 4] * 2):
         with pytest.raises(MitsonarError, match="four finite numbers: got"):
-            env.step(wrong_action)  # type: ignore[arg-type]
+            env.step(wrong_action)
     for wrong in ({"start": [1, 2]}, {"bounds": [[1, 1, 1], [0, 0, 0]]}, {"observe": ("pose",)}, {"max_steps": 0}):
         with pytest.raises(MitsonarError):
             SonarEnv(simulator, **wrong)
