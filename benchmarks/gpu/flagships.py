@@ -252,6 +252,8 @@ def logged(out: Path, name: str, *words: object) -> subprocess.Popen[bytes]:
 
 def process(out: Path, name: str, words: Any) -> subprocess.Popen[bytes]:
     """Start Python with these words in a session of its own."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job, whose children would ignore it, too
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     with log_of(out, name).open("ab") as log:
         return subprocess.Popen([sys.executable, *words], stdout=log, stderr=log, start_new_session=True)
 

@@ -227,6 +227,8 @@ def command(arguments: Request, name: str, words: list[str], *, goes_on: bool = 
     log.parent.mkdir(parents=True, exist_ok=True)
     paths = [str(ROOT / "benchmarks"), *filter(None, [os.environ.get("PYTHONPATH")])]
     world = {**os.environ, "MITSONAR_VARIANT": arguments.variant, "PYTHONPATH": os.pathsep.join(paths), **environment}
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job, whose children would ignore it, too
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     with log.open("ab") as file:
         file.write(f"$ {' '.join(words)}\n".encode())
         file.flush()

@@ -219,7 +219,7 @@ def test_a_sequence_of_both_is_refused(made: list[str], tmp_path: Path) -> None:
 # ---------------------------------------------------------------- memory
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_one_run_at_a_time_is_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The peak of joining four runs in small shards is that of two."""
     monkeypatch.setattr("mitsonar.datasets.store.SHARD_BYTES", 2**20)

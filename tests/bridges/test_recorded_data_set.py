@@ -206,7 +206,7 @@ def test_compare_gives_the_errors_of_the_estimator_on_the_run(
         compare(tmp_path / "data.zarr", "zero", ComparisonOptions(part="all", perturb=True))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_an_aris_file_and_its_path_are_compared(mitsonar: Command, places: dict[str, Path], tmp_path: Path) -> None:
     out = tmp_path / "dive.zarr"
     done = mitsonar("dataset", "from-frames", places["aris"], "--poses", places["path"], "--cut", 6, "-o", out)
@@ -345,7 +345,7 @@ def test_hostile_recipes_are_refused(places: dict[str, Path], tmp_path: Path, ch
 
 
 @pytest.mark.learn
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_rendered_runs_are_compared_and_fine_tuned_on(mitsonar: Command, variant: str, tmp_path: Path) -> None:
     pytest.importorskip("torch")
     for name, end in (("one", "-0.43,-4.76,2.5,35,0,2"), ("two", "-0.58,-4.8,2.5,35,0,-1")):

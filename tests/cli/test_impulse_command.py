@@ -63,7 +63,7 @@ def test_it_writes_responses_and_figures(mitsonar: Command, scene: Path, tmp_pat
 
 
 @pytest.mark.posix
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_killed_and_resumed_it_is_the_unbroken_one(mitsonar: Command, scene: Path, tmp_path: Path) -> None:
     arguments = ["impulse", scene, "--velocity", "1,-0.5,3", "--frames", 400]
     whole = mitsonar(*arguments, "-o", tmp_path / "whole")

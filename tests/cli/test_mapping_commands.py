@@ -218,7 +218,7 @@ SAME = (
 
 
 @pytest.mark.posix
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_killed_odometry_resumes_to_the_same_files_with_any_workers(mitsonar: Command, tmp_path: Path) -> None:
     over_ground(sway(120)).save(tmp_path / "frames.npz")
     assert mitsonar("odometry", tmp_path, "-o", tmp_path / "whole", "--workers", 1).returncode == 0
@@ -322,7 +322,7 @@ def test_a_bad_mosaic_is_answered_by_one_sentence(mitsonar: Command, drawn: Path
     assert not list(tmp_path.glob("*.png"))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_odometry_and_mosaic_speak_the_convention_that_is_named(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
     """Paths are the same ones, the mosaic too; a folder remembers its own convention."""
     for frame in ("mitsonar", "ros-enu", "ned"):
@@ -352,7 +352,7 @@ def test_odometry_and_mosaic_speak_the_convention_that_is_named(mitsonar: Comman
     refused(mitsonar("odometry", drawn, "-o", tmp_path / "y", "--frame", "nde"), "unknown frame 'nde'", "did you mean ned?")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_local_map_resumes_to_the_same_bits(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     done = mitsonar("odometry", drawn, "--map", "-o", whole)

@@ -37,7 +37,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_folder_of_fans_becomes_a_path_and_a_mosaic(mitsonar: Command, pictures: Path, tmp_path: Path) -> None:
     message = ["--geometry", str(pictures / "fan.yaml")]
     built = mitsonar("odometry", pictures / "pictures", "-o", tmp_path / "path", "--estimator", "direct", *message)

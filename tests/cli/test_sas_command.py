@@ -84,7 +84,7 @@ def test_a_body_is_where_its_path_says(mitsonar: Command, tmp_path: Path) -> Non
     refused(mitsonar("sas", tmp_path / "tank.xml", *ENDS, *SMALL, "--moving", f"boat={tmp_path / 'here.tum'}"), "boat")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_another_navigation_is_corrected(mitsonar: Command, tmp_path: Path) -> None:
     """Flown with a sway of 1 mm; the navigation knows a straight line."""
     straight = Trajectory.between(Pose(0, -1.2, 2.5), Pose(0, 1.2, 2.5), 97, 20.0)
@@ -108,7 +108,7 @@ def test_another_navigation_is_corrected(mitsonar: Command, tmp_path: Path) -> N
     assert again.returncode == 0, again.stderr
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_pairs_of_pings_without_coherence_are_named(mitsonar: Command, tmp_path: Path) -> None:
     """One fix of the navigation is 0.5 m off to the side, beyond the delays that are compared."""
     straight = Trajectory.between(Pose(0, -1.2, 2.5), Pose(0, 1.2, 2.5), 49, 10.0)

@@ -29,7 +29,7 @@ def coherent_recipe() -> Recipe:
     return result
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_workers_do_not_change_bits(tmp_path: Path) -> None:
     for workers in (1, 2):
         make_dataset(coherent_recipe(), str(tmp_path / f"{workers}.zarr"), workers=workers)

@@ -383,7 +383,7 @@ def test_two_workers_make_the_same_bytes(made: Path, tmp_path: Path) -> None:
     assert files_of(tmp_path / "tiny.zarr") == files_of(made)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.e2e
 def test_workers_of_a_scheduler_make_the_same_bytes_and_a_lost_one_is_replaced(made: Path, tmp_path: Path) -> None:
     """A scheduler by its address; one of its workers is killed while it renders, and nothing is lost."""
@@ -466,7 +466,7 @@ def test_no_scheduler_there(mitsonar: Command, tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.posix
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.e2e
 def test_killed_at_ten_random_moments_and_finished_it_is_the_unbroken_one(made: Path, tmp_path: Path) -> None:
     """kill -9, whatever it is doing; then the same command is repeated until it finishes."""
@@ -629,7 +629,7 @@ def test_an_unfinished_data_set_is_not_read_by_accident(tmp_path: Path) -> None:
     assert make_dataset(recipe, url).new_shards == store.shards - 1
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.e2e
 def test_a_full_disk_is_said_and_loses_nothing(made: Path, tmp_path: Path) -> None:
     """A real file system of 120 kB; after making room, the same command goes on."""
@@ -728,7 +728,7 @@ def objects_of(url: str) -> dict[str, bytes]:
     return {name: place.read(name) for name in place.sizes()}
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.e2e
 def test_to_and_from_object_storage(made: Path, bucket: str, tmp_path: Path) -> None:
     """Against a real S3 server: made, killed, gone on with, checked, read; the bytes are those of the folder."""
@@ -782,7 +782,7 @@ def test_objects_of_others_are_kept(bucket: str) -> None:
 
 
 @pytest.mark.e2e
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_storage_that_does_not_answer(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     monkeypatch.setenv("AWS_MAX_ATTEMPTS", "1")

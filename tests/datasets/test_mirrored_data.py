@@ -73,7 +73,7 @@ def test_images_are_those_of_the_simulator_with_mirrors(model: str, tmp_path: Pa
     assert pings.levels.sum() > 1.02 * without.levels.sum()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_re_rendering_and_bounds_use_the_mirrors_of_the_data_set(tmp_path: Path) -> None:
     url = str(tmp_path / "data.zarr")
     make_dataset(mirrored_recipe("physical"), url)
@@ -106,7 +106,7 @@ def test_frames_that_are_rendered_in_training_have_mirrors() -> None:
     assert sums(SURFACE) > 1.02 * sums(None)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("direct", essence([False, True], True))
 def test_responses_are_those_of_the_simulator_with_mirrors(direct: bool, tmp_path: Path) -> None:
     recipe = impulse_recipe(

@@ -49,7 +49,7 @@ def straight(tmp_path_factory: pytest.TempPathFactory, variant: str) -> Path:
 # ---------------------------------------------------------------- what is stored
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_responses_are_what_the_simulator_hears(made: Path, tmp_path: Path) -> None:
     """Two routes: each scene is built, loaded and simulated here, ping by ping."""
     from mitsonar.simulation.channel import ChannelSimulator
@@ -71,7 +71,7 @@ def test_responses_are_what_the_simulator_hears(made: Path, tmp_path: Path) -> N
     assert np.abs(response).max(axis=2).min() > 0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_same_recipe_gives_the_same_bytes_and_a_lost_shard_comes_back(made: Path, tmp_path: Path) -> None:
     url = tmp_path / "again.zarr"
     make_dataset(impulse_recipe(), str(url))

@@ -419,7 +419,7 @@ def test_heights_are_those_of_the_sonar_below_its_vehicle(variant: str, tmp_path
     assert all(2.0 <= height <= 2.4 for height in rendered)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_workers_render_worlds_of_their_own() -> None:
     """Two spawned workers share the epoch's length, and no sample is made twice."""
     pairs = RenderedPairs(tiny_recipe(), seed=2, length=30, sequences_per_world=3, buffer=5, gain=0.02)

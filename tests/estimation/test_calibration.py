@@ -145,7 +145,7 @@ def test_simulated_values_come_back(simulated: SonarFrames) -> None:
     assert written.elevation_fov_deg == pytest.approx(found["elevation_fov_deg"], abs=0.01)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_errors_have_the_size_of_their_standard_deviations() -> None:
     """Draws of the model: the squared errors relative to the covariance have the mean 1."""
     names = ("height_m", "pitch_deg", "roll_deg", "taper_db", "elevation_fov_deg", "noise_level_db")

@@ -147,7 +147,7 @@ def sharpness(found: ImpulseResponses, grid: StripGrid, path: NDArray[np.float64
     return float((power**2).mean() / power.mean() ** 2)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_autofocus_makes_an_image_as_sharp_as_along_the_true_path() -> None:
     """A sway of 5 mm, a third of the wavelength, with a period of 4 m, over ground with some stones."""
     rng = np.random.default_rng(1)

@@ -209,7 +209,7 @@ def test_marginals_of_a_long_path_are_those_of_columns(monkeypatch: pytest.Monke
     np.testing.assert_allclose(of_long, of_short, rtol=1e-4, atol=1e-10)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_errors_over_covariances_are_one_by_draws() -> None:
     """60 draws of the whole model; the mean of 60 chi-squares of three, a third, scatters by 11 %."""
     normalised = []

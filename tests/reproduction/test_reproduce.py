@@ -479,7 +479,7 @@ def test_killed_and_called_again_it_reaches_the_same_table(
         assert all(torch.equal(mine[key], others[key]) for key in others)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_is_done_is_not_done_again(whole: Path) -> None:
     before = told(whole)
     runs = {path: path.stat().st_mtime_ns for path in (whole / "runs").rglob("*") if path.is_file()}

@@ -85,7 +85,7 @@ def test_what_is_no_plane_with_waves_makes_no_ghosts(tmp_path: Path) -> None:
     assert built.kinds == ("scatterer", "surface")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("out", essence([True, False], True))
 def test_ghosts_by_waves_are_those_of_their_mean_plane_with_the_loss_of_all_waves(out: bool, tmp_path: Path) -> None:
     """Delay and amplitude of a flat plate at that plane, whose roughness is that of all waves; crests hide nothing."""

@@ -50,7 +50,7 @@ def test_point_spread(shading: str, pattern: str) -> None:
             assert level[part].max() == pytest.approx(expected[part].max(), abs=1.0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_point_shows_the_lobes_of_an_array_with_errors() -> None:
     sonar = SONAR.replace(pattern="receive", elevation_pattern="box", beams=256, azimuth_fov_deg=20.0, beam_width_deg=0.4)
     loaded, fields, _ = one_point()

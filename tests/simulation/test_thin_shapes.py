@@ -99,7 +99,7 @@ def test_what_hides_a_rod_hides_its_points() -> None:
     assert hidden.echoes(np.zeros(6))[1].points == 0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_largest_shapes_are_left_to_the_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     loaded = scene(first=rod(0.002), second={**rod(0.01), "p0": [0.2, AHEAD, -0.1], "p1": [0.2, AHEAD, 0.1]})
     source = imager(loaded, FAN).tracer
@@ -108,7 +108,7 @@ def test_the_largest_shapes_are_left_to_the_rays(monkeypatch: pytest.MonkeyPatch
     assert np.array(imager(loaded, FAN).tracer.is_thin).tolist() == [True, False]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_instances_are_left_to_the_rays() -> None:
     group = {"type": "shapegroup", "rod": rod(0.01)}
     loaded = scene(group=group, one={"type": "instance", "group": {"type": "ref", "id": "group"}}, other=rod(0.004))

@@ -615,7 +615,7 @@ def agrees(content: bytes, checkpoint: Checkpoint, batch: int) -> dict[str, str]
     return about
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_onnx_says_the_same() -> None:
     checkpoint = trained_like("cnn4b")
     about = agrees(to_onnx(checkpoint, 2), checkpoint, 2)
@@ -666,7 +666,7 @@ def test_the_geometry_goes_into_onnx(geometric: Checkpoint, made: Path) -> None:
             assert np.abs(got - want.numpy()).max() < 1e-4 * np.abs(want.numpy()).max()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_export_writes_a_file_once(mitsonar: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoint = trained_like("posenet")
     checkpoint.save(tmp_path / "network.ckpt")

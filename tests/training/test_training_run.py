@@ -281,7 +281,7 @@ def test_batches_are_the_same_wherever_they_are_finished(made: Path) -> None:
         assert one["frames"].tolist() == samples.first[[number for _, number in planned]].tolist()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_rendered_samples_are_skipped_without_rendering_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """Worlds that lie behind are not built again; what waited in the buffer is."""
     words: dict[str, Any] = {"sequences_per_world": 3, "buffer": 6, "gain": 0.02, "noise": "none"}
@@ -485,7 +485,7 @@ def killed(told: Path, data: Path | str, out: Path, when: str, *, render: bool =
 
 
 @pytest.mark.linux
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.e2e
 def test_killed_runs_end_with_the_same_bits(made: Path, whole: Path, tmp_path: Path) -> None:
     """Killed while it writes its state, and in the middle of its second epoch: weights, optimiser, log as if unbroken."""
@@ -519,7 +519,7 @@ def test_killed_runs_that_render_end_with_the_same_bits(tmp_path: Path) -> None:
     assert result.metrics["none"]["pairs"] == 5
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_validation_states_and_workers_do_not_touch_the_training(made: Path, whole: Path, tmp_path: Path) -> None:
     """Nor does the global state of torch: it is left as it was."""
     torch.manual_seed(7)

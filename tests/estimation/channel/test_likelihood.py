@@ -75,7 +75,7 @@ def test_delay_of_a_resting_and_of_a_moving_receiver() -> None:
     np.testing.assert_allclose(moving, met, rtol=1e-14)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["points", "simulator"])
 @pytest.mark.usefixtures("variant")
 def test_covariance_of_scatterers_drawn_at_random(source: str) -> None:
@@ -94,7 +94,7 @@ def test_covariance_of_scatterers_drawn_at_random(source: str) -> None:
     assert abs(energy - 1) < 0.25, f"energy {energy:.3f} of the law's"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_energy_at_every_delay_is_that_of_the_simulator() -> None:
     """Fifths of the taps within 0.3 dB of the law's, four receivers at 300 poses over cells; near nadir and aside."""
@@ -168,7 +168,7 @@ def test_known_motions_come_back(name: str, bound_mm: float) -> None:
     assert abs((got * true).sum() / (true**2).sum() - 1) < 0.05
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_likelihood_is_nearer_than_correlation_over_many_grounds() -> None:
     """On one ground either may be; over twelve the default's errors are the smaller ones, and as large as it says."""
     motion = Motion(0.0056, 0.0028, 0.0)

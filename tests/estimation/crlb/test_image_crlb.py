@@ -438,7 +438,7 @@ def test_an_oracle_reaches_the_bound_of_gaussian_noise() -> None:
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_an_oracle_reaches_the_bound_of_the_pixel_law() -> None:
     """Least squares reaches the matched bound; the exact one takes the likelihood."""
     who = oracle(24, 96, 6)
@@ -504,7 +504,7 @@ def test_segments_and_their_sums() -> None:
 SCENE = floor_scene('<texture type="cell_noise" name="reflectance"><integer name="cells" value="2000"/></texture>')
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_the_command_answers_the_buyer(tmp_path: Path) -> None:
     """Twice the height: cells twice as far apart, larger errors; no noise: no exact bound, and words that say so."""
@@ -535,7 +535,7 @@ def test_the_command_answers_the_buyer(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_command_reads_data_sets(tmp_path: Path) -> None:
     from helpers import tiny_recipe
 

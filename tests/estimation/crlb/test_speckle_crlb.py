@@ -191,7 +191,7 @@ def grain_oracle(bounds: SpeckleBounds, draws: int) -> float:
 
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize("noise_db", essence([-90.0, -75.0], -90.0))
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_an_oracle_of_the_scatterers_reaches_the_grain_bound(noise_db: float) -> None:
     """At a high and at a low ratio of echo to noise."""
     value = grain_oracle(limits(noise_db, even=True), 12)
@@ -218,7 +218,7 @@ def ground_oracle(bounds: SpeckleBounds, draws: int) -> float:
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("looks", essence([1, 3], 1))
 def test_an_oracle_of_the_level_reaches_the_ground_bound(looks: int) -> None:
     value = ground_oracle(limits(-75.0, looks=looks), 10)
@@ -239,7 +239,7 @@ def test_looks_tell_more_of_the_ground() -> None:
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_grain_tells_far_more_than_ground_and_noise_hides_both() -> None:
     quiet, loud = (next(limits(noise_db).at_poses(np.array(POSE))) for noise_db in (-90.0, -75.0))
     assert (quiet["grain"].std(2) < 0.05 * quiet["ground"].std(2)).all()
@@ -259,7 +259,7 @@ def test_grain_tells_far_more_than_ground_and_noise_hides_both() -> None:
         SpeckleBounds(saturated, 1.0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_commands_answer_coherent_data_sets(tmp_path: Path, mitsonar: Command) -> None:
     """`crlb` says which laws it used, and `compare` divides by the last of them."""

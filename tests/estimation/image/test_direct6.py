@@ -89,7 +89,7 @@ def test_a_pose_and_a_motion_come_back() -> None:
     np.testing.assert_allclose(np.diag(result.covariance), np.diag(both), rtol=0.2)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_errors_are_those_of_the_bound() -> None:
     """Frames without the noise of rays: root mean square errors are near the bound, and no less, but for scatter."""
