@@ -235,10 +235,10 @@ sys.meta_path.insert(0, Block)
 """
 
 
-def essence(values: Iterable[Any], *quick: Any) -> list[Any]:
-    """Values of a test's parameter, or tuples of several: all but the quick ones are marked ``thorough``."""
+def essence(values: Iterable[Any], *quick: Any, rest: pytest.MarkDecorator = pytest.mark.thorough) -> list[Any]:
+    """Values of a test's parameter, or tuples of several: all but the quick ones are marked, by default ``thorough``."""
     parts = [(value, value if isinstance(value, tuple) else (value,)) for value in values]
-    return [pytest.param(*one, marks=() if value in quick else pytest.mark.thorough) for value, one in parts]
+    return [pytest.param(*one, marks=() if value in quick else rest) for value, one in parts]
 
 
 def run_python(script: str, *, block: tuple[str, ...] = (), **environment: str) -> str:

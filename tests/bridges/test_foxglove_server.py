@@ -230,7 +230,7 @@ def started(*words: str) -> tuple[subprocess.Popen[str], int]:
 @pytest.mark.thorough
 @pytest.mark.posix
 @pytest.mark.e2e
-@pytest.mark.parametrize("number", essence([signal.SIGINT, signal.SIGTERM], signal.SIGTERM))
+@pytest.mark.parametrize("number", essence([signal.SIGINT, signal.SIGTERM], signal.SIGTERM, rest=pytest.mark.slow))
 def test_a_path_is_played_and_a_signal_ends_the_server_cleanly(number: signal.Signals) -> None:
     process, port = started("--trajectory", "shipped", "--rate", "20")
     client = client_of(port, ["/sonar/timing"])

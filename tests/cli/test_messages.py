@@ -188,7 +188,7 @@ def test_a_name_that_is_near_none_is_not_guessed() -> None:
 def test_printed_commands_can_be_pasted(mitsonar: Command, tmp_path: Path) -> None:
     """A folder with a space, a quote and a dollar sign."""
     folder = tmp_path / "my world's $5"
-    done = mitsonar("world", "flat-objects", "--size-m", 4, "-o", folder)
+    done = mitsonar("world", "flat-objects", "--size-m", 4, "--objects", "5,10", "-o", folder)
     assert done.returncode == 0, done.stderr
     printed = done.stdout.partition("render it with: ")[2].strip()
     words = subprocess.run(

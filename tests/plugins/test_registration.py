@@ -124,7 +124,7 @@ KEPT = """
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("order", essence(ORDERS, "mitsuba, variant, mitsonar"))
+@pytest.mark.parametrize("order", essence(ORDERS, "mitsuba, variant, mitsonar", rest=pytest.mark.slow))
 def test_order_of_imports_and_variants(order: str) -> None:
     run_python(textwrap.dedent(SCENE) + textwrap.dedent(ORDERS[order]))
 

@@ -202,7 +202,7 @@ def test_doppler_in_a_turn_is_the_slope_of_the_delay(velocity: tuple[float, ...]
     assert np.abs(here.doppler_hz - slope).max() < sonar.carrier_hz * second_order
 
 
-@pytest.mark.parametrize("tilt", [45.0, pytest.param(60.0, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("tilt", [45.0, pytest.param(60.0, marks=pytest.mark.slow)])
 @pytest.mark.thorough
 def test_doppler_of_an_angle(tilt: float) -> None:
     """Within 0.5 %: phase between responses 40 um apart of a narrow beam, mean over places. (A beam that moves over the

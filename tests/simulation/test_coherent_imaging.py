@@ -301,7 +301,7 @@ def before(flat: mi.Scene) -> tuple[CoherentImager, Array]:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", essence(MOTIONS, *ESSENCE))
+@pytest.mark.parametrize("name", essence(MOTIONS, *ESSENCE, rest=pytest.mark.slow))
 def test_speckle_follows_a_motion_as_theory_says(before: tuple[CoherentImager, Array], name: str) -> None:
     """Fields before and after, weighted by the predicted phase of each pixel: the coherence within 0.03 of the integral."""
     source, motion = before[0], np.array(MOTIONS[name])

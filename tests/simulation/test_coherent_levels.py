@@ -63,7 +63,7 @@ PRESETS = sorted(set(named_sonars()) - {"lookdown100"})
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", essence(PRESETS, "blueview-p900-45"))
+@pytest.mark.parametrize("name", essence(PRESETS, "blueview-p900-45", rest=pytest.mark.slow))
 @pytest.mark.filterwarnings("ignore::mitsonar.errors.MitsonarWarning")
 def test_the_sonar_equation_holds_for_every_preset(flat: mi.Scene, name: str) -> None:
     """Values of frames, read as dB re 1 uPa, less the gain: 0.5 dB in each of up to ten parts of the lit ranges, 1 to 40 m.

@@ -122,7 +122,7 @@ def test_a_turn_about_the_vertical_keeps_what_lies_inside(tmp_path: Path) -> Non
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("shape", essence(["sphere", "cylinder", "disk", "rectangle"], "sphere"))
+@pytest.mark.parametrize("shape", essence(["sphere", "cylinder", "disk", "rectangle"], "sphere", rest=pytest.mark.slow))
 def test_outlines_of_shapes_that_are_no_meshes(shape: str) -> None:
     """The difference of the ends of a step is the mean of the derivative along it."""
     turned = mi.ScalarTransform4f().translate([0.2, -0.3, 0.35]).rotate([1, 0, 0], 20).scale(0.133)

@@ -178,7 +178,7 @@ QUICK = (("DIDSON", 2.0), ("ARIS", 3.0))
 @pytest.mark.parametrize(
     ("name", "focus_m"),
     [
-        (name, at) if (name, at) in QUICK else pytest.param(name, at, marks=pytest.mark.thorough)
+        (name, at) if (name, at) in QUICK else pytest.param(name, at, marks=pytest.mark.slow)
         for name in INSTRUMENTS
         for at in (2.0, 3.0, 4.4, 12.0)
     ],

@@ -56,7 +56,7 @@ def poses() -> Array:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("diameter", essence([0.002, 0.004, 0.008], 0.004))
+@pytest.mark.parametrize("diameter", essence([0.002, 0.004, 0.008], 0.004, rest=pytest.mark.slow))
 @pytest.mark.parametrize("mesh", [True, False])
 def test_a_thin_rod_has_the_energy_of_its_diameter_in_every_ping(
     poses: Array, tmp_path: Path, diameter: float, mesh: bool
