@@ -179,7 +179,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
         frames: of a real or simulated sonar, at rest or slow; linear, dB or gamma.
         base: source of what the recording does not show: carrier, beam width, patterns; default: the sonar of the frames.
         measure_coding: take the coding from the grain instead of the one that the frames state. It assumes one look.
-        given: known fields, which replace those of the base.
+        given: known fields, which replace those of the base and are not fitted.
 
     Raises:
         MitsonarError: frames that are too small, empty or not finite, or fields that the model coherent lacks.
@@ -254,6 +254,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
             fitted["noise_level_db"] = round(float(statistics.decibels(noise)) + full_scale_db, 1)
             fitted["detector_offset_db"] = round(float(statistics.decibels(noise * ratio)) + full_scale_db, 1)
         notes += scale_notes
+    fitted = {name: value for name, value in fitted.items() if name not in given}
     middle = float(gain_of(sonar)[len(frames.range_m) // 2])
     return SonarFit(
         sonar=sonar.replace(**fitted),
