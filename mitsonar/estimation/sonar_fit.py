@@ -838,9 +838,16 @@ def as_instrument(frames: SonarFrames) -> tuple[SonarFrames, list[str]]:
 
     Beams are laid out at even angles, or at even sines of them, whichever is nearer to the bearings of the frames. The
     window begins half a bin before the first range and ends half a bin beyond the last.
+
+    Raises:
+        MitsonarError: frames of one bin or one beam, which have no spacing.
     """
     bearings, ranges = frames.bearing_rad, frames.range_m
     count = len(bearings)
+    if min(count, len(ranges)) < 2:
+        raise MitsonarError(
+            f"the sonar of a recording needs two or more bins and beams: got {len(ranges)} x {count}; give frames of images"
+        )
     middle = (bearings[0] + bearings[-1]) / 2
     # try both layouts, and choose the one whose beams are nearest to the bearings
     layouts: dict[Layout, float] = {}
