@@ -59,13 +59,14 @@ def fan_figure(
     if frames.level == "dB":
         low, high = frames.decibels_of(0.0), frames.decibels_of(1.0)
         label = "level (dB re 1 uPa)" if frames.sonar.source_level_db else "level (dB re the source at 1 m)"
-        label = "level (dB re full scale)" if (low, high) == (-frames.sonar.coding_db, 0.0) else label
+        label = "level (dB re full scale)" if high == 0 else label  # low is as far below as the coding spans, but rounded
         label += " with gain" if frames.sonar.gain_exponent or frames.sonar.gain_absorption else ""
         values, norm = low + top_db + values * (high - low), Normalize(low + top_db, high + top_db)
     else:
         norm, label = PowerNorm(GAMMA, vmin=0, vmax=1), f"level (1 = full scale; shown with gamma {GAMMA:g})"
     shown = axes.imshow(values, extent=fan.extent, cmap="copper", norm=norm, interpolation="nearest")
-    axes.set(xlabel="starboard (m)", ylabel="forward (m)", title=title)
+    axes.set(xlabel="starboard (m)", ylabel="forward (m)")
+    axes.set_title(title, parse_math=False)  # names of files may hold $
     figure.colorbar(shown, ax=axes, label=label, fraction=0.04)
     if outlines is not None:
         from mitsonar.plotting.outlines import add_legend, colours_of
