@@ -573,6 +573,10 @@ CAMERA_AXES = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Axes of a camera (starboard, down, forward), as columns in (starboard, forward, up)."""
 
 
+UNEVEN = 0.1
+"""Deviation of a beam from the even angles of neusis above which it warns, as a fraction of the beam spacing."""
+
+
 def export_kitti(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
     """Write KITTI's ``poses/00.txt``, ``sequences/00/times.txt`` and ``sequences/00/image_0/``; yield after each frame.
 
@@ -620,6 +624,9 @@ def export_neusis(source: ExportSource, pictures: LabelledPictures, folder: Path
     A pickle contains ``ImagingSonar``, float32 ``(bins, beams)`` in 0..1, with the nearest range in row 0 and the beam
     farthest to *starboard* in column 0, and ``PoseSensor``, the matrix ``(4, 4)`` from the sonar's axes (x forward, y to
     port, z up) to the world. In neusis the bearing of a pixel increases to port with its column. Pictures must be polar.
+
+    Warns:
+        MitsonarWarning: beams are not at even angles about the axis, where neusis places them.
     """
     require_poses(source)
     (folder / "Data").mkdir()
@@ -632,6 +639,15 @@ def export_neusis(source: ExportSource, pictures: LabelledPictures, folder: Path
     sonar = source.like.sonar
     bearing_rad = source.like.bearing_rad
     fov = float(np.ptp(bearing_rad)) * (1 + 1 / max(1, len(bearing_rad) - 1))
+    step = fov / len(bearing_rad)
+    off = float(np.abs((np.arange(len(bearing_rad)) - (len(bearing_rad) - 1) / 2) * step - bearing_rad).max())
+    if off > UNEVEN * step:
+        warnings.warn(
+            f"neusis places beams at even angles about the axis, up to {math.degrees(off):.2g} deg from those of "
+            f"{source.name}: give frames of a sonar with beam_layout even, and crop the same number of beams on both sides",
+            MitsonarWarning,
+            stacklevel=2,
+        )
     configuration = {
         "Azimuth": math.degrees(fov),
         "Elevation": sonar.elevation_fov_deg,

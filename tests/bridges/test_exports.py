@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -265,6 +266,21 @@ def test_points_of_neusis_lie_where_ours_do(mitsonar: Command, run: Path, frames
             ours = frames.range_m[row] * direction(frames.sonar, frames.bearing_rad[beam], phi)
             turned = vehicle_rotation(frames.poses[number]).apply(ours)[0] + frames.poses[number, :3]  # type: ignore[index]
             np.testing.assert_allclose(theirs, turned, atol=1e-6)
+
+
+@pytest.mark.parametrize(("layout", "first", "warns"), [("even", 0, False), ("sine", 0, True), ("even", 4, True)])
+def test_neusis_warns_of_beams_that_it_places_elsewhere(
+    frames: SonarFrames, tmp_path: Path, layout: str, first: int, warns: bool
+) -> None:
+    bearing = SONAR.replace(beam_layout=layout).bearing_rad[first:]
+    named = {"shape_id": None, "object_id": None, "shape_names": (), "object_names": ()}
+    moved = replace(frames, image=frames.image[:, :, first:], bearing_rad=bearing, **named)
+    moved.save(tmp_path / "frames.npz")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        export_to("neusis", open_export(tmp_path / "frames.npz"), tmp_path / "views")
+    assert len(caught) == warns
+    assert all("neusis places beams at even angles about the axis" in str(one.message) for one in caught)
 
 
 # ---------------------------------------------------------------- sources, and the folder
