@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -289,10 +290,12 @@ def to_decibels(frames: SonarFrames, span_db: float, top_db: float = 0.0) -> Son
     Lower levels become 0, higher ones 1. The top is ``top_db`` re full scale.
 
     Raises:
-        MitsonarError: the span is not in 0..300 dB.
+        MitsonarError: the span is not in 0..300 dB, or the top is not finite.
     """
     if not 0 < span_db <= 300:
         raise MitsonarError(f"the span must lie in 0..300 dB: got {span_db:g}")
+    if not math.isfinite(top_db):
+        raise MitsonarError(f"the top must be a finite level in dB re full scale: got {top_db:g}")
     values = to_float32(frames.image)
     if frames.level == "dB":
         coded = 1 + (values - 1) * np.float32(frames.sonar.coding_db / span_db) - np.float32(top_db / span_db)

@@ -82,3 +82,6 @@ def test_a_figure_states_what_its_levels_refer_to(span_db: float) -> None:
 def test_a_span_that_cannot_be_is_refused() -> None:
     with pytest.raises(MitsonarError, match="the span must lie in"):
         to_decibels(over_ground(sway(3)), 0)
+    for top_db in (-np.inf, np.nan):
+        with pytest.raises(MitsonarError, match="the top must be a finite level"):
+            to_decibels(over_ground(sway(3)), 60, top_db)
