@@ -661,7 +661,7 @@ Shares = Annotated[
     str | None,
     typer.Option(
         "--split",
-        help="Shares of training, validation and test (default: the recipe's; for a run 0.7,0.15,0.15).",
+        help="Shares of training, validation and test (default: the recipe's; for COCO and YOLO of a run 0.7,0.15,0.15).",
     ),
 ]
 Polygons = Annotated[bool, typer.Option("--polygons", help="YOLO: write outlines instead of boxes.")]
