@@ -201,6 +201,9 @@ def test_what_cannot_work_is_refused() -> None:
         fit_height_map(frames, poses, np.array([30.0]))
     with pytest.raises(MitsonarError, match="shows no ground"):
         fit_height_map(frames, poses * [1, 1, 1, -1, 1, 1], known)
+    edges = replace(frames, sonar=SONAR.replace(elevation_pattern="two_way"))
+    with pytest.raises(MitsonarError, match="no frame shows ground within the elevation field of view"):
+        fit_height_map(edges, poses * [1, 1, 1, 0.1, 1, 1], known)
     with pytest.raises(MitsonarError, match="one for each frame"):
         fit_height_map(frames, poses_around(2), known)
     with pytest.raises(MitsonarError, match="no echo"):
