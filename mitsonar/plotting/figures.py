@@ -559,7 +559,13 @@ def ground_range_figure(scan: GroundScan, *, span_db: float = SHOWN_SPAN_DB, tit
 
 
 def _waterfall_options(span_db: float) -> dict[str, Any]:
-    """Return the options of a picture of levels in dB whose first row is at the bottom."""
+    """Return the options of a picture of levels in dB whose first row is at the bottom.
+
+    Raises:
+        MitsonarError: the span is not in 0..300 dB.
+    """
+    if not 0 < span_db <= 300:
+        raise MitsonarError(f"the span must lie in 0..300 dB: got {span_db:g}")
     return {
         "cmap": "copper",
         "vmin": -span_db,
