@@ -306,6 +306,8 @@ def convert(
         raise MitsonarError(f"--scan-db and --scan-from apply only to MCAP files: got {out}; leave them out")
     if scan_from and scan_db is None:
         raise MitsonarError("--scan-from needs --scan-db, the least level of a return, such as --scan-db -20")
+    if out.suffix not in (".mcap", ".aris") and "://" not in file and Path(file).resolve().is_relative_to(out.resolve()):
+        raise MitsonarError(f"-o {out} would replace the frames that are read: choose another folder")
     if resume and out.suffix:
         raise MitsonarError("--resume applies only to folders, since a file is written whole: leave it out")
     returns = None if scan_db is None else FirstReturns(scan_db, scan_from)

@@ -240,6 +240,15 @@ def test_mistakes_are_one_sentence(
     assert not list(tmp_path.iterdir())
 
 
+def test_frames_are_not_replaced_while_they_are_read(mitsonar: Command, places: dict[str, Path], tmp_path: Path) -> None:
+    assert mitsonar("recording", "convert", places["npz"], "-o", tmp_path / "a").returncode == 0
+    before = (tmp_path / "a" / "frames.npz").read_bytes()
+    for given in (tmp_path / "a", tmp_path / "a" / "frames.npz"):
+        again = mitsonar("recording", "convert", given, "-o", tmp_path / "a", "--crop-bins", "0,8", "--overwrite")
+        refused(again, "would replace the frames that are read")
+    assert (tmp_path / "a" / "frames.npz").read_bytes() == before
+
+
 def test_handedness_is_told_on_request(mitsonar: Command, tmp_path: Path) -> None:
     """A drawn floor under a sonar that turns by 9 deg to starboard agrees, and its mirror image does not."""
     turning = path_of(np.tile([0.0, 0.0, np.radians(0.6)], (15, 1)), START, np.arange(16) / 10)
