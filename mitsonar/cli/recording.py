@@ -529,6 +529,8 @@ def from_recording(
     from mitsonar.estimation.sonar_fit import as_instrument
     from mitsonar.mapping.sources import open_frames
 
+    if noise is not None and noise.resolve() == out.resolve():
+        raise MitsonarError(f"-o and --noise both name {out}: give two files, or leave --noise out for one with everything")
     for path in (out, noise):
         if path is not None:
             refuse_to_replace(path, overwrite=overwrite)

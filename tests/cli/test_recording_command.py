@@ -189,6 +189,8 @@ def test_fits_name_the_command_for_recordings_and_the_missing_carrier(
 ) -> None:
     out = tmp_path / "sonar.yaml"
     refused(mitsonar("sonar", "fit", places["mcap"], "-o", out), "is a recording: give `mitsonar sonar from-recording")
+    twice = mitsonar("sonar", "from-recording", places["mcap"], "-o", out, "--noise", out)
+    refused(twice, "-o and --noise both name")
     for words in (("from-recording",), ("calibrate",)):
         refused(mitsonar("sonar", *words, places["mcap"], "-o", out), "state the carrier: give --set frequency_hz=1.8e6")
     assert not out.exists()
