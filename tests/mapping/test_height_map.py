@@ -230,6 +230,15 @@ def test_a_mesh_holds_the_known_cells(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.ravel(stored), result.std_m[known], rtol=1e-6)
 
 
+def test_a_mesh_far_from_the_origin_keeps_its_cells(tmp_path: Path) -> None:
+    far = replace(fitted(1)[0], west_m=500_000.0, north_m=6_000_000.0)
+    save_height_map(tmp_path / "map.ply", far)
+    mesh = trimesh.load_mesh(tmp_path / "map.ply", process=False)
+    known = np.isfinite(far.height_m)
+    x, y = far.centres
+    np.testing.assert_allclose(mesh.vertices[:, :2], np.column_stack([x[known], y[known]]), rtol=0, atol=1e-6)
+
+
 def test_a_geotiff_is_north_up_and_in_metres(tmp_path: Path) -> None:
     result, _ = fitted(1)
     save_height_map(tmp_path / "map.tif", result)
