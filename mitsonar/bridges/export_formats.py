@@ -18,6 +18,7 @@ from typing import IO
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from mitsonar.bridges.export_source import (
     LEAST_SNR_DB,
@@ -160,8 +161,8 @@ def _copy(source: Path, target: IO[str]) -> None:
 def export_yolo(source: ExportSource, pictures: LabelledPictures, folder: Path, *, polygons: bool = False) -> Iterator[int]:
     """Write YOLO's ``images/PART/``, ``labels/PART/`` and ``data.yaml``; yield after each frame.
 
-    A line of a label file has the class and the centre and size of the box, or with ``polygons`` the outline, as fractions
-    of the picture's size. Parts are train, val and test; ``data.yaml`` lists those that have frames.
+    A line of a label file, one for each object, has the class and the centre and size of the box, or with ``polygons`` the
+    outline, as fractions of the picture's size. Parts are train, val and test; ``data.yaml`` lists those that have frames.
     """
     require_labels(source)
     parts = [YOLO_PARTS[part] for part in _parts_of(source)]
@@ -170,9 +171,7 @@ def export_yolo(source: ExportSource, pictures: LabelledPictures, folder: Path, 
             (folder / kind / part).mkdir(parents=True)
     for shot in shots(source):
         part = YOLO_PARTS[shot.part]
-        lines = [
-            line for region in _regions(source, pictures, shot) for line in _yolo_lines(region, pictures.size, polygons)
-        ]
+        lines = [_yolo_line(region, pictures.size, polygons) for region in _regions(source, pictures, shot)]
         write_atomic(folder / "images" / part / f"{shot.name}.png", png(pictures.picture(shot.frames, shot.index)))
         write_atomic(folder / "labels" / part / f"{shot.name}.txt", "".join(f"{line}\n" for line in lines).encode())
         yield 1
@@ -181,18 +180,30 @@ def export_yolo(source: ExportSource, pictures: LabelledPictures, folder: Path, 
     write_atomic(folder / "data.yaml", yaml.safe_dump(table, sort_keys=False, allow_unicode=True).encode())
 
 
-def _yolo_lines(region: Region, size: tuple[int, int], polygons: bool) -> list[str]:
+def _yolo_line(region: Region, size: tuple[int, int], polygons: bool) -> str:
     columns, rows = size
     if polygons:
-        outlines = [outline / size for outline in _outlines(region)]
-        return [" ".join([str(region.kind), *(f"{value:.6f}" for value in outline.ravel())]) for outline in outlines]
+        return " ".join([str(region.kind), *(f"{value:.6f}" for value in (_outline(region) / size).ravel())])
     column, row, width, height = region.box
     values = ((column + width / 2) / columns, (row + height / 2) / rows, width / columns, height / rows)
-    return [" ".join([str(region.kind), *(f"{value:.6f}" for value in values)])]
+    return " ".join([str(region.kind), *(f"{value:.6f}" for value in values)])
 
 
-def _outlines(region: Region) -> list[np.ndarray[tuple[int, ...], np.dtype[np.float64]]]:
-    """Return the outer outlines of a region ``(points, 2)`` through pixel centres; a line of pixels becomes a rectangle."""
+def _outline(region: Region) -> NDArray[np.float64]:
+    """Return one outline of a region ``(points, 2)``: YOLO takes each line for an object, so its parts are joined.
+
+    The outline goes to each further part and back along the shortest line from what it has already passed.
+    """
+    joined, *others = sorted(_outlines(region), key=len, reverse=True)
+    middle = joined.mean(axis=0)
+    for part in sorted(others, key=lambda points: float(np.linalg.norm(points.mean(axis=0) - middle))):
+        here, there = divmod(int(cdist(joined, part).argmin()), len(part))
+        joined = np.concatenate([joined[: here + 1], part[there:], part[: there + 1], joined[here:]])
+    return joined
+
+
+def _outlines(region: Region) -> list[NDArray[np.float64]]:
+    """Return the outlines of the parts of a region ``(points, 2)`` through pixel centres; a line of them is a rectangle."""
     import cv2
 
     contours, _ = cv2.findContours(region.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
@@ -573,6 +584,10 @@ CAMERA_AXES = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Axes of a camera (starboard, down, forward), as columns in (starboard, forward, up)."""
 
 
+UNEVEN = 0.1
+"""Deviation of a beam from the even angles of neusis above which it warns, as a fraction of the beam spacing."""
+
+
 def export_kitti(source: ExportSource, pictures: LabelledPictures, folder: Path) -> Iterator[int]:
     """Write KITTI's ``poses/00.txt``, ``sequences/00/times.txt`` and ``sequences/00/image_0/``; yield after each frame.
 
@@ -620,6 +635,9 @@ def export_neusis(source: ExportSource, pictures: LabelledPictures, folder: Path
     A pickle contains ``ImagingSonar``, float32 ``(bins, beams)`` in 0..1, with the nearest range in row 0 and the beam
     farthest to *starboard* in column 0, and ``PoseSensor``, the matrix ``(4, 4)`` from the sonar's axes (x forward, y to
     port, z up) to the world. In neusis the bearing of a pixel increases to port with its column. Pictures must be polar.
+
+    Warns:
+        MitsonarWarning: beams are not at even angles about the axis, where neusis places them.
     """
     require_poses(source)
     (folder / "Data").mkdir()
@@ -632,6 +650,15 @@ def export_neusis(source: ExportSource, pictures: LabelledPictures, folder: Path
     sonar = source.like.sonar
     bearing_rad = source.like.bearing_rad
     fov = float(np.ptp(bearing_rad)) * (1 + 1 / max(1, len(bearing_rad) - 1))
+    step = fov / len(bearing_rad)
+    off = float(np.abs((np.arange(len(bearing_rad)) - (len(bearing_rad) - 1) / 2) * step - bearing_rad).max())
+    if off > UNEVEN * step:
+        warnings.warn(
+            f"neusis places beams at even angles about the axis, up to {math.degrees(off):.2g} deg from those of "
+            f"{source.name}: give frames of a sonar with beam_layout even, and crop the same number of beams on both sides",
+            MitsonarWarning,
+            stacklevel=2,
+        )
     configuration = {
         "Azimuth": math.degrees(fov),
         "Elevation": sonar.elevation_fov_deg,

@@ -221,7 +221,7 @@ def numbers(text: str | None, count: int, what: str) -> list[float] | None:
     """Parse ``count`` numbers that are separated by commas; None stays None.
 
     Raises:
-        MitsonarError: the text is not that many numbers.
+        MitsonarError: the text is not that many finite numbers.
     """
     if text is None:
         return None
@@ -231,6 +231,8 @@ def numbers(text: str | None, count: int, what: str) -> list[float] | None:
         values = []
     if len(values) != count:
         raise MitsonarError(f"{what} takes {count} numbers, separated by commas: got {text!r}")
+    if not all(map(math.isfinite, values)):
+        raise MitsonarError(f"{what} takes finite numbers: got {text!r}")
     return values
 
 

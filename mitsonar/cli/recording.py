@@ -306,6 +306,8 @@ def convert(
         raise MitsonarError(f"--scan-db and --scan-from apply only to MCAP files: got {out}; leave them out")
     if scan_from and scan_db is None:
         raise MitsonarError("--scan-from needs --scan-db, the least level of a return, such as --scan-db -20")
+    if out.suffix not in (".mcap", ".aris") and "://" not in file and Path(file).resolve().is_relative_to(out.resolve()):
+        raise MitsonarError(f"-o {out} would replace the frames that are read: choose another folder")
     if resume and out.suffix:
         raise MitsonarError("--resume applies only to folders, since a file is written whole: leave it out")
     returns = None if scan_db is None else FirstReturns(scan_db, scan_from)
@@ -527,6 +529,8 @@ def from_recording(
     from mitsonar.estimation.sonar_fit import as_instrument
     from mitsonar.mapping.sources import open_frames
 
+    if noise is not None and noise.resolve() == out.resolve():
+        raise MitsonarError(f"-o and --noise both name {out}: give two files, or leave --noise out for one with everything")
     for path in (out, noise):
         if path is not None:
             refuse_to_replace(path, overwrite=overwrite)
@@ -661,7 +665,7 @@ Shares = Annotated[
     str | None,
     typer.Option(
         "--split",
-        help="Shares of training, validation and test (default: the recipe's; for a run 0.7,0.15,0.15).",
+        help="Shares of training, validation and test (default: the recipe's; for COCO and YOLO of a run 0.7,0.15,0.15).",
     ),
 ]
 Polygons = Annotated[bool, typer.Option("--polygons", help="YOLO: write outlines instead of boxes.")]

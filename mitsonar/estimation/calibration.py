@@ -102,8 +102,8 @@ def calibrate_sonar(
 ) -> Calibration:
     """Calibrate a sonar of the model coherent with frames of roughly level ground.
 
-    Frames with poses are taken to be z above the ground, up to a common error of height, pitch and roll. Frames without
-    poses are taken to share theirs.
+    Frames with poses are taken to be z above the ground, whose z is that of their heights or else 0, up to a common error of
+    height, pitch and roll. Frames without poses are taken to share theirs.
 
     Args:
         frames: of a real or simulated sonar; linear, dB or gamma.
@@ -132,6 +132,7 @@ def calibrate_sonar(
     if not fixed.get("height_m", 1.0) > 0:
         raise MitsonarError(f"the height must be positive: got {height_m:g} m; give the height over the ground")
     # 1. All frames give the result.
+    frames = _over_ground(frames)
     reference = reference_of(frames)
     problem = GroundProblem(frames, sonar, fit, reference, each_beam=beam_gains)
     solution = problem.solve(fixed, beam_gains=beam_gains)
@@ -150,6 +151,14 @@ def calibrate_sonar(
         looks = [even.looks_of_frame(one) for one in solutions]
         held_out = dict(zip(("calibrated", "sonar fit"), odd.scores(solutions, looks), strict=True))
     return _result(problem, solution, fit, fixed, held_out)
+
+
+def _over_ground(frames: SonarFrames) -> SonarFrames:
+    """Return the frames with z over the ground, which lies at the median of what their heights give."""
+    if frames.poses is None or frames.height_m is None or not np.isfinite(frames.height_m).any():
+        return frames
+    ground_m = float(np.nanmedian(frames.poses[:, 2] - frames.height_m))
+    return replace(frames, poses=frames.poses - np.array([0, 0, ground_m, 0, 0, 0]))
 
 
 def _result(

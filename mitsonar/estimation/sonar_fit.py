@@ -179,7 +179,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
         frames: of a real or simulated sonar, at rest or slow; linear, dB or gamma.
         base: source of what the recording does not show: carrier, beam width, patterns; default: the sonar of the frames.
         measure_coding: take the coding from the grain instead of the one that the frames state. It assumes one look.
-        given: known fields, which replace those of the base.
+        given: known fields, which replace those of the base and are not fitted.
 
     Raises:
         MitsonarError: frames that are too small, empty or not finite, or fields that the model coherent lacks.
@@ -254,6 +254,7 @@ def fit_sonar(frames: SonarFrames, base: Sonar | None = None, *, measure_coding:
             fitted["noise_level_db"] = round(float(statistics.decibels(noise)) + full_scale_db, 1)
             fitted["detector_offset_db"] = round(float(statistics.decibels(noise * ratio)) + full_scale_db, 1)
         notes += scale_notes
+    fitted = {name: value for name, value in fitted.items() if name not in given}
     middle = float(gain_of(sonar)[len(frames.range_m) // 2])
     return SonarFit(
         sonar=sonar.replace(**fitted),
@@ -837,9 +838,16 @@ def as_instrument(frames: SonarFrames) -> tuple[SonarFrames, list[str]]:
 
     Beams are laid out at even angles, or at even sines of them, whichever is nearer to the bearings of the frames. The
     window begins half a bin before the first range and ends half a bin beyond the last.
+
+    Raises:
+        MitsonarError: frames of one bin or one beam, which have no spacing.
     """
     bearings, ranges = frames.bearing_rad, frames.range_m
     count = len(bearings)
+    if min(count, len(ranges)) < 2:
+        raise MitsonarError(
+            f"the sonar of a recording needs two or more bins and beams: got {len(ranges)} x {count}; give frames of images"
+        )
     middle = (bearings[0] + bearings[-1]) / 2
     # try both layouts, and choose the one whose beams are nearest to the bearings
     layouts: dict[Layout, float] = {}

@@ -328,6 +328,11 @@ class _Fit:
         self._ground = [reflectivity * m for m in ground]
         self.leak = LEAKS[-1]
         self.seen = self._seen()
+        if not self.seen.any():
+            raise MitsonarError(
+                "no frame shows ground within the elevation field of view: at the given height and pitch, only the edges of "
+                f"the beams light it; check {argument('height_m')} and {argument('pitch_deg')}"
+            )
 
     def _seen(self) -> NDArray[np.bool_]:
         """Return the cells that lie within the fan and the elevation field of view of some view ``(cells, cells)``."""

@@ -40,8 +40,6 @@ def save_height_map(path: str | Path, height_map: HeightMap) -> None:
 
 def _ply(height_map: HeightMap) -> bytes:
     """Return a binary PLY mesh, two triangles for each square of four known cells."""
-    import trimesh
-
     # 1. Number the known cells; each is a vertex.
     known = np.isfinite(height_map.height_m)
     number = np.cumsum(known).reshape(known.shape) - 1
@@ -49,16 +47,19 @@ def _ply(height_map: HeightMap) -> bytes:
     vertices = np.column_stack([x[known], y[known], height_map.height_m[known]])
     # 2. Squares with four known corners; triangles run counter-clockwise as seen from above.
     whole = known[:-1, :-1] & known[:-1, 1:] & known[1:, :-1] & known[1:, 1:]
-    corners = [part[whole] for part in (number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:])]
-    north_west, north_east, south_west, south_east = corners
-    faces = np.concatenate(
-        [np.column_stack([north_west, south_west, south_east]), np.column_stack([north_west, south_east, north_east])]
-    )
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    mesh.vertex_attributes["std_m"] = height_map.std_m[known].astype(np.float32)
-    content = mesh.export(file_type="ply", vertex_normal=False)
-    assert isinstance(content, bytes)
-    return content
+    parts = (number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:])
+    north_west, north_east, south_west, south_east = (part[whole] for part in parts)
+    corners = [(north_west, south_west, south_east), (north_west, south_east, north_east)]
+    faces = np.concatenate([np.column_stack(triangle) for triangle in corners])
+    # 3. Positions of double precision: in single, eastings and northings of a map on the Earth are rounded to 0.5 m.
+    points = np.zeros(len(vertices), [("xyz", "<f8", 3), ("std_m", "<f4")])
+    points["xyz"], points["std_m"] = vertices, height_map.std_m[known]
+    triangles = np.zeros(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
+    triangles["count"], triangles["corners"] = 3, faces
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header += [*(f"property double {axis}" for axis in "xyz"), "property float std_m"]
+    header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header", ""]
+    return "\n".join(header).encode() + points.tobytes() + triangles.tobytes()
 
 
 def _geotiff(height_map: HeightMap) -> bytes:

@@ -118,7 +118,8 @@ def _lit_elevation(sonar: Sonar) -> float:
     if sonar.vertical_pattern == "box":
         return half
     elevation = np.linspace(0, math.pi / 2, 1000)
-    return float(elevation[np.argmax(_elevation_power(sonar, elevation) < FAINTEST)])
+    faint = _elevation_power(sonar, elevation) < FAINTEST
+    return float(elevation[np.argmax(faint)]) if faint.any() else math.pi / 2
 
 
 def _elevation_power(sonar: Sonar, elevation: Array) -> Array:

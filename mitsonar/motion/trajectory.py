@@ -383,7 +383,8 @@ def _refuse_other_convention(path: str | Path, line: str, convention: Convention
     name = match.group(1) if match else "mitsonar" if MITSONAR_AXES in line else convention.name
     if name != convention.name:
         raise MitsonarError(
-            f"trajectory {path} is in the convention {name}, but --frame is {convention.name}: give --frame {name}"
+            f"trajectory {path} is in the convention {name}, but --frame is {convention.name}: give --frame {name}, or "
+            f"a path in the convention {convention.name}"
         )
 
 

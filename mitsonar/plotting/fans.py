@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -59,13 +60,14 @@ def fan_figure(
     if frames.level == "dB":
         low, high = frames.decibels_of(0.0), frames.decibels_of(1.0)
         label = "level (dB re 1 uPa)" if frames.sonar.source_level_db else "level (dB re the source at 1 m)"
-        label = "level (dB re full scale)" if (low, high) == (-frames.sonar.coding_db, 0.0) else label
+        label = "level (dB re full scale)" if high == 0 else label  # low is as far below as the coding spans, but rounded
         label += " with gain" if frames.sonar.gain_exponent or frames.sonar.gain_absorption else ""
         values, norm = low + top_db + values * (high - low), Normalize(low + top_db, high + top_db)
     else:
         norm, label = PowerNorm(GAMMA, vmin=0, vmax=1), f"level (1 = full scale; shown with gamma {GAMMA:g})"
     shown = axes.imshow(values, extent=fan.extent, cmap="copper", norm=norm, interpolation="nearest")
-    axes.set(xlabel="starboard (m)", ylabel="forward (m)", title=title)
+    axes.set(xlabel="starboard (m)", ylabel="forward (m)")
+    axes.set_title(title, parse_math=False)  # names of files may hold $
     figure.colorbar(shown, ax=axes, label=label, fraction=0.04)
     if outlines is not None:
         from mitsonar.plotting.outlines import add_legend, colours_of
@@ -288,10 +290,12 @@ def to_decibels(frames: SonarFrames, span_db: float, top_db: float = 0.0) -> Son
     Lower levels become 0, higher ones 1. The top is ``top_db`` re full scale.
 
     Raises:
-        MitsonarError: the span is not in 0..300 dB.
+        MitsonarError: the span is not in 0..300 dB, or the top is not finite.
     """
     if not 0 < span_db <= 300:
         raise MitsonarError(f"the span must lie in 0..300 dB: got {span_db:g}")
+    if not math.isfinite(top_db):
+        raise MitsonarError(f"the top must be a finite level in dB re full scale: got {top_db:g}")
     values = to_float32(frames.image)
     if frames.level == "dB":
         coded = 1 + (values - 1) * np.float32(frames.sonar.coding_db / span_db) - np.float32(top_db / span_db)

@@ -161,7 +161,7 @@ def height_map_figure(
         axes.set_xlabel("x, east [m]")
         axes.set_ylabel("y, north [m]")
     if title:
-        figure.suptitle(title, fontsize=11)
+        figure.suptitle(title, fontsize=11, parse_math=False)  # names of files may hold $
     return figure
 
 
@@ -264,7 +264,8 @@ def _finish_map(axes: Axes, mosaic: LevelMap, paths: Mapping[str, Trajectory], t
     """Set limits, labels, scale bar and legend."""
     west, east, south, north = _view(mosaic, paths)
     axes.set(xlim=(west, east), ylim=(south, north), aspect="equal")
-    axes.set(xlabel="x, east (m)", ylabel="y, north (m)", title=title)
+    axes.set(xlabel="x, east (m)", ylabel="y, north (m)")
+    axes.set_title(title, parse_math=False)  # names of files may hold $
     _scale_bar(axes, east - west)
     if paths:
         axes.legend(loc="upper left", fontsize="small")
@@ -310,7 +311,8 @@ CLOCK_FROM_S = 1e6
 
 def _label_path(above: Axes, over_time: list[Axes], title: str) -> None:
     """Set labels, legend and grids of :func:`path_figure`."""
-    above.set(xlabel="x, east (m)", ylabel="y, north (m)", title=title, aspect="equal")
+    above.set(xlabel="x, east (m)", ylabel="y, north (m)", aspect="equal")
+    above.set_title(title, parse_math=False)
     above.set_adjustable("datalim")
     above.legend(loc="best")
     over_time[0].set_ylabel("heading (deg)")
@@ -536,7 +538,7 @@ def side_scan_figure(
     axes.set(xlim=(-far, far), ylim=along, xlabel="slant range, port - starboard (m)", ylabel=_along_label(echogram))
     figure.colorbar(image, ax=axes, label="level (dB)")
     usual = f"{echogram.sounder.name}, {echogram.sounder.fan.model}, {count_noun(len(echogram), 'ping')}"
-    axes.set_title(usual if title is None else title, fontsize=10)
+    axes.set_title(usual if title is None else title, fontsize=10, parse_math=False)
     return figure
 
 
@@ -552,12 +554,18 @@ def ground_range_figure(scan: GroundScan, *, span_db: float = SHOWN_SPAN_DB, tit
     image = axes.imshow(level, extent=extent, **_waterfall_options(span_db))
     axes.set(ylim=along, xlabel="ground range, port - starboard (m)", ylabel=_along_label(scan.echogram))
     figure.colorbar(image, ax=axes, label="level (dB)")
-    axes.set_title(title, fontsize=10)
+    axes.set_title(title, fontsize=10, parse_math=False)
     return figure
 
 
 def _waterfall_options(span_db: float) -> dict[str, Any]:
-    """Return the options of a picture of levels in dB whose first row is at the bottom."""
+    """Return the options of a picture of levels in dB whose first row is at the bottom.
+
+    Raises:
+        MitsonarError: the span is not in 0..300 dB.
+    """
+    if not 0 < span_db <= 300:
+        raise MitsonarError(f"the span must lie in 0..300 dB: got {span_db:g}")
     return {
         "cmap": "copper",
         "vmin": -span_db,
@@ -591,7 +599,7 @@ def strip_figure(image: StripImage, *, title: str = "", span_db: float = 50.0) -
     )
     axes.set(xlim=sorted(edges[0]), ylim=edges[1], xlabel="ground range to starboard (m)", ylabel="along the track (m)")
     figure.colorbar(drawn, ax=axes, label="level (dB)", fraction=0.046 * min(ratio, 1.0), pad=0.02)
-    axes.set_title(title, fontsize=10)
+    axes.set_title(title, fontsize=10, parse_math=False)
     return figure
 
 

@@ -113,6 +113,7 @@ def add_legend(figure: Figure, names: Sequence[str], kinds: Sequence[int]) -> No
         legend = figure.legend(handles=lines, loc="outside lower center", ncols=min(len(lines), 5), facecolor="0.15")
         for text in legend.get_texts():
             text.set_color("white")
+            text.set_parse_math(False)  # names of shapes may hold $
 
 
 def legend_strip(width: int, names: Sequence[str], rows: int) -> Picture:

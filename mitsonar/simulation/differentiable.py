@@ -31,8 +31,8 @@ INSTRUMENT = ("absorption_db_per_m", "beam_width_deg", "elevation_fov_deg", "sou
 LEAST = {"absorption_db_per_m": 0, "beam_width_deg": 0.01, "elevation_fov_deg": 0.1, "sound_speed": 1, "taper_db": -60}
 """Smallest values of these."""
 
-OF_PATTERNS = ("absorption_db_per_m", "beam_width_deg", "elevation_fov_deg")
-"""Those that only sonars with a beam pattern have."""
+OF_BEAMS, OF_ELEVATION = ("absorption_db_per_m", "beam_width_deg"), ("elevation_fov_deg",)
+"""Those that only sonars with a pattern of the beams have, and with a pattern over elevation."""
 
 
 class DifferentiableSimulator:
@@ -89,8 +89,9 @@ class DifferentiableSimulator:
             pose: x, y, z [m], pitch, roll, heading [rad], numbers or ``mi.Float``; default: the pose in the scene.
             ping: number of the ping, which draws the places of jittered rays in their cells.
             instrument: numbers or ``mi.Float``. In place of those of the sonar, if it has a beam pattern:
-                ``beam_width_deg``, ``elevation_fov_deg``, ``absorption_db_per_m``. Besides: ``taper_db``, which the model
-                ``physical`` leaves out, and the true ``sound_speed`` [m/s]; bins and gain are those of the sonar's own.
+                ``beam_width_deg``, ``absorption_db_per_m``, and with one over elevation ``elevation_fov_deg``. Besides:
+                ``taper_db``, which the model ``physical`` leaves out, and the true ``sound_speed`` [m/s]; bins and gain are
+                those of the sonar's own.
 
         Returns:
             Levels ``(bins, beams)``.
@@ -176,8 +177,12 @@ class DifferentiableSimulator:
         for name, value in given.items():
             if name not in INSTRUMENT:
                 raise MitsonarError(f"unknown property {short_repr(name)}: {suggest_names(name, INSTRUMENT)}")
-            if name in OF_PATTERNS and self.sonar.vertical_pattern == "box":
-                raise MitsonarError(f"{name} needs a beam pattern: give the sonar pattern two_way")
+            for names, field, pattern in (
+                (OF_BEAMS, "pattern", self.sonar.beam_pattern),
+                (OF_ELEVATION, "elevation_pattern", self.sonar.vertical_pattern),
+            ):
+                if name in names and pattern == "box":
+                    raise MitsonarError(f"{name} needs a beam pattern: give the sonar {field} two_way")
             least = LEAST[name]
             if dr.width(value) != 1 or not (number := float(dr.detach(value)[0])) >= least or not math.isfinite(number):
                 raise MitsonarError(f"{name} must be one number of at least {least:g}: got {value}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -155,6 +156,22 @@ def test_yolo_has_a_line_an_object(mitsonar: Command, run: Path, frames: SonarFr
         assert drawn.sum() in ((frames.object_id[1] == 1).sum(), (frames.object_id[1] == 2).sum())  # type: ignore[index]
 
 
+def test_parts_of_an_object_are_one_outline(frames: SonarFrames, tmp_path: Path) -> None:
+    """YOLO takes each line for an object: a barrel in three parts is one, and its outline holds them all."""
+    shape = np.full(frames.image.shape, -1, np.int32)
+    for rows, columns in ((slice(5, 9), slice(2, 6)), (slice(12, 20), slice(10, 14)), (slice(30, 31), slice(3, 9))):
+        shape[:, rows, columns] = 2
+    replace(frames, shape_id=shape, object_id=None).save(tmp_path / "frames.npz")
+    source = open_export(tmp_path / "frames.npz", split=(0.5, 0.25, 0.25))
+    export_to("yolo", source, tmp_path / "yolo", polygons=True, least_snr_db=-np.inf)
+    (line,) = (tmp_path / "yolo" / "labels" / "train" / "000000.txt").read_text().splitlines()
+    points = np.array(line.split()[1:], float).reshape(-1, 2) * (BEAMS, BINS) - 0.5
+    cv2 = pytest.importorskip("cv2")
+    drawn = cv2.fillPoly(np.zeros((BINS, BEAMS), np.uint8), [points.round().astype(np.int32)], 1)
+    assert (drawn[shape[0] == 2] == 1).mean() > 0.9
+    assert drawn.sum() < 2 * (shape[0] == 2).sum()
+
+
 # ---------------------------------------------------------------- WebDataset and Hugging Face
 
 
@@ -265,6 +282,21 @@ def test_points_of_neusis_lie_where_ours_do(mitsonar: Command, run: Path, frames
             ours = frames.range_m[row] * direction(frames.sonar, frames.bearing_rad[beam], phi)
             turned = vehicle_rotation(frames.poses[number]).apply(ours)[0] + frames.poses[number, :3]  # type: ignore[index]
             np.testing.assert_allclose(theirs, turned, atol=1e-6)
+
+
+@pytest.mark.parametrize(("layout", "first", "warns"), [("even", 0, False), ("sine", 0, True), ("even", 4, True)])
+def test_neusis_warns_of_beams_that_it_places_elsewhere(
+    frames: SonarFrames, tmp_path: Path, layout: str, first: int, warns: bool
+) -> None:
+    bearing = SONAR.replace(beam_layout=layout).bearing_rad[first:]
+    named = {"shape_id": None, "object_id": None, "shape_names": (), "object_names": ()}
+    moved = replace(frames, image=frames.image[:, :, first:], bearing_rad=bearing, **named)
+    moved.save(tmp_path / "frames.npz")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        export_to("neusis", open_export(tmp_path / "frames.npz"), tmp_path / "views")
+    assert len(caught) == warns
+    assert all("neusis places beams at even angles about the axis" in str(one.message) for one in caught)
 
 
 # ---------------------------------------------------------------- sources, and the folder

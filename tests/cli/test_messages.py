@@ -19,7 +19,7 @@ import typer
 from drawn_frames import over_ground, sway
 from helpers import Command, essence, refused, run_python
 
-from mitsonar.cli.console import OPTIONS, _Log, answered, command_line, say, say_json, warn
+from mitsonar.cli.console import OPTIONS, _Log, answered, command_line, numbers, say, say_json, warn
 from mitsonar.errors import MitsonarError, argument, did_you_mean, suggest_names
 from mitsonar.geometry.ground import attitude_of
 
@@ -302,6 +302,12 @@ def test_a_signal_ends_a_rendering_that_goes_on(number: signal.Signals, mitsonar
     assert process.returncode == 128 + number
     assert output.splitlines()[-1] == f"stopped: {STAYS} with --resume continues"
     assert mitsonar(*words, "--resume", cwd=tmp_path).returncode == 0
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "1,-inf"])
+def test_numbers_of_options_are_finite(text: str) -> None:
+    with pytest.raises(MitsonarError, match=f"--pixel takes finite numbers: got '{text}'"):
+        numbers(text, text.count(",") + 1, "--pixel")
 
 
 def test_printed_json_has_no_words_of_python(capfd: pytest.CaptureFixture[str]) -> None:

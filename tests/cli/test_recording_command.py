@@ -189,6 +189,8 @@ def test_fits_name_the_command_for_recordings_and_the_missing_carrier(
 ) -> None:
     out = tmp_path / "sonar.yaml"
     refused(mitsonar("sonar", "fit", places["mcap"], "-o", out), "is a recording: give `mitsonar sonar from-recording")
+    twice = mitsonar("sonar", "from-recording", places["mcap"], "-o", out, "--noise", out)
+    refused(twice, "-o and --noise both name")
     for words in (("from-recording",), ("calibrate",)):
         refused(mitsonar("sonar", *words, places["mcap"], "-o", out), "state the carrier: give --set frequency_hz=1.8e6")
     assert not out.exists()
@@ -238,6 +240,15 @@ def test_mistakes_are_one_sentence(
     given = [str(places["npz"]) if word == "FRAMES" else word for word in words]
     refused(mitsonar("recording", *given, cwd=tmp_path), reason)
     assert not list(tmp_path.iterdir())
+
+
+def test_frames_are_not_replaced_while_they_are_read(mitsonar: Command, places: dict[str, Path], tmp_path: Path) -> None:
+    assert mitsonar("recording", "convert", places["npz"], "-o", tmp_path / "a").returncode == 0
+    before = (tmp_path / "a" / "frames.npz").read_bytes()
+    for given in (tmp_path / "a", tmp_path / "a" / "frames.npz"):
+        again = mitsonar("recording", "convert", given, "-o", tmp_path / "a", "--crop-bins", "0,8", "--overwrite")
+        refused(again, "would replace the frames that are read")
+    assert (tmp_path / "a" / "frames.npz").read_bytes() == before
 
 
 def test_handedness_is_told_on_request(mitsonar: Command, tmp_path: Path) -> None:

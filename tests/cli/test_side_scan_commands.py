@@ -166,6 +166,8 @@ def test_a_simulated_line_is_shown_and_mapped_as_a_real_one(mitsonar: Command, t
             "--height must be one number above 0",
         ),
         (("recording", "show", "FILE", "-o", "x.png", "--height", 3, "--stored-height"), "exclude each other"),
+        (("recording", "show", "FILE", "-o", "x.png", "--span-db", -5), "the span must lie in 0..300 dB: got -5"),
+        (("recording", "show", "FILE", "-o", "x.png", "--ground-range", "--height", 3, "--span-db", "nan"), "0..300 dB"),
         (("recording", "info", "FILE", "--handedness"), "--handedness applies only to frames"),
         (("recording", "convert", "FILE", "-o", "x.mcap"), "converted to .xtf or .npz"),
         (("recording", "convert", "FILE", "-o", "x.xtf", "--beams", 48), "--beams applies only to frames"),

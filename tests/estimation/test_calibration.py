@@ -199,6 +199,17 @@ def test_one_place_does_not_determine_everything() -> None:
     assert "gain and reflectivity together" in result.lines()[0]
 
 
+@pytest.mark.thorough
+def test_heights_place_the_ground() -> None:
+    """Over ground at z = -3 m, frames that have their heights give what they do over ground at 0."""
+    frames = drawn(PLACES, 1, 9)
+    assert frames.poses is not None
+    lowered = replace(frames, poses=frames.poses - [0, 0, 3, 0, 0, 0], height_m=frames.poses[:, 2])
+    one, other = (calibrate_sonar(some).parameters for some in (frames, lowered))
+    for name, parameter in one.items():
+        assert other[name].value == pytest.approx(parameter.value, abs=0.01 * parameter.std)
+
+
 def test_a_single_frame_holds_nothing_out() -> None:
     assert calibrate_sonar(drawn(PLACES[:1], 1, 9)).held_out is None
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers import Command
 
+from mitsonar.errors import MitsonarError
 from mitsonar.estimation.sonar_fit import NOISE_FIELDS, as_instrument
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
@@ -45,6 +46,12 @@ def test_a_fan_off_the_axis_is_told() -> None:
     result, (note,) = as_instrument(replace(frames, bearing_rad=frames.bearing_rad + np.radians(2)))
     assert "centred on 2 deg" in note
     np.testing.assert_allclose(result.sonar.bearing_rad, frames.sonar.bearing_rad, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [{"beams": 1, "range_bins": 64}, {"beams": 64, "range_bins": 1}])
+def test_one_beam_or_bin_is_refused(size: dict[str, int]) -> None:
+    with pytest.raises(MitsonarError, match="needs two or more bins and beams: got"):
+        as_instrument(frames_of(Sonar(**size)))
 
 
 @pytest.mark.skipif(not OCULUS.exists(), reason="needs the recordings of ../shared/data/real")

@@ -246,6 +246,14 @@ def test_one_small_frame_is_not_called_clipped() -> None:
     assert not any("clipped" in one for one in (*fit.notes, *fit.lines()))
 
 
+def test_known_fields_are_not_fitted() -> None:
+    sonar = Sonar.create(beams=16, range_bins=96, frequency_hz=1.8e6, coding="linear")
+    level = 0.01 * np.random.default_rng(2).exponential(size=(1, 96, 16))
+    known = {"noise_level_db": -50.0, "stripes_db": 1.5, "speckle_nu": 3.0, "near_glow_db": 5.0}
+    fit = fit_sonar(SonarFrames(level, sonar.range_m, sonar.bearing_rad, np.zeros(1), sonar), **known).sonar
+    assert {name: getattr(fit, name) for name in known} == known
+
+
 def test_frames_that_tell_nothing_are_refused() -> None:
     with pytest.raises(MitsonarError, match="at least one frame of 96 bins x 16 beams: got 2 of 64 x 32"):
         fit_sonar(blank(bins=64))

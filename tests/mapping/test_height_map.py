@@ -201,6 +201,9 @@ def test_what_cannot_work_is_refused() -> None:
         fit_height_map(frames, poses, np.array([30.0]))
     with pytest.raises(MitsonarError, match="shows no ground"):
         fit_height_map(frames, poses * [1, 1, 1, -1, 1, 1], known)
+    edges = replace(frames, sonar=SONAR.replace(elevation_pattern="two_way"))
+    with pytest.raises(MitsonarError, match="no frame shows ground within the elevation field of view"):
+        fit_height_map(edges, poses * [1, 1, 1, 0.1, 1, 1], known)
     with pytest.raises(MitsonarError, match="one for each frame"):
         fit_height_map(frames, poses_around(2), known)
     with pytest.raises(MitsonarError, match="no echo"):
@@ -225,6 +228,15 @@ def test_a_mesh_holds_the_known_cells(tmp_path: Path) -> None:
     assert (mesh.face_normals[:, 2] > 0).all(), "faces point up"
     stored = mesh.metadata["_ply_raw"]["vertex"]["data"]["std_m"]
     np.testing.assert_allclose(np.ravel(stored), result.std_m[known], rtol=1e-6)
+
+
+def test_a_mesh_far_from_the_origin_keeps_its_cells(tmp_path: Path) -> None:
+    far = replace(fitted(1)[0], west_m=500_000.0, north_m=6_000_000.0)
+    save_height_map(tmp_path / "map.ply", far)
+    mesh = trimesh.load_mesh(tmp_path / "map.ply", process=False)
+    known = np.isfinite(far.height_m)
+    x, y = far.centres
+    np.testing.assert_allclose(mesh.vertices[:, :2], np.column_stack([x[known], y[known]]), rtol=0, atol=1e-6)
 
 
 def test_a_geotiff_is_north_up_and_in_metres(tmp_path: Path) -> None:

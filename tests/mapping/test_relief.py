@@ -69,6 +69,18 @@ def test_waves_have_the_levels_of_the_model_physical(variant: str, tmp_path: Pat
     assert np.corrcoef(truth[used], flat[used])[0, 1] < 0.8, "the waves must show, or the test is void"
 
 
+@pytest.mark.parametrize("pattern", ["two_way", "receive"])
+def test_wide_patterns_light_the_ground(pattern: str) -> None:
+    """A pattern that is faint nowhere lights what a narrower one does, and more."""
+    lit = []
+    for wide in (30.0, 60.0, 90.0):
+        sonar = SONAR.replace(elevation_fov_deg=wide, elevation_pattern=pattern)
+        lit.append(np.isfinite(lit_ground(sonar, sonar.bearing_rad, sonar.range_m, POSE, 0.0)).all(axis=-1))
+    assert lit[0].any()
+    assert (lit[1] | ~lit[0]).all()
+    assert (lit[2] | ~lit[1]).all()
+
+
 def test_a_wall_hides_what_lies_within_its_shadow() -> None:
     # A wall 0.2 m high and one cell thick; a shadow from range a ends at b with 0.2 = H (1 - a / b).
     pose = np.array([0.0, 0.0, 1.5, math.radians(20), 0.0, 0.0])

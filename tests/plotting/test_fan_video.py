@@ -10,7 +10,7 @@ import pytest
 from drawn_frames import over_ground, sway
 
 from mitsonar import MitsonarError
-from mitsonar.plotting.fans import to_decibels, write_fan_video
+from mitsonar.plotting.fans import fan_figure, to_decibels, write_fan_video
 
 cv2 = pytest.importorskip("cv2")
 
@@ -71,6 +71,17 @@ def test_values_of_each_coding_become_decibels(level: str, value: float, decibel
     assert below_top == pytest.approx(0 if decibels is None else min(1, 1 + (decibels + 30) / 60), abs=1e-6)
 
 
+@pytest.mark.parametrize("span_db", [3.0, 4.0, 60.0, 81.66622741539722])
+def test_a_figure_states_what_its_levels_refer_to(span_db: float) -> None:
+    frames = over_ground(sway(3))
+    frames = replace(frames, sonar=frames.sonar.replace(source_level_db=0.0, gain_exponent=0), level_scale=1.0)
+    figure = fan_figure(to_decibels(frames, span_db))
+    assert figure.axes[1].get_ylabel() == "level (dB re full scale)"
+
+
 def test_a_span_that_cannot_be_is_refused() -> None:
     with pytest.raises(MitsonarError, match="the span must lie in"):
         to_decibels(over_ground(sway(3)), 0)
+    for top_db in (-np.inf, np.nan):
+        with pytest.raises(MitsonarError, match="the top must be a finite level"):
+            to_decibels(over_ground(sway(3)), 60, top_db)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,6 +85,13 @@ def test_a_figure_names_what_it_shows(frames: SonarFrames) -> None:
     assert fan_figure(frames).legends == []
     nothing = replace(frames, shape_id=np.full(frames.image.shape, -1, np.int32))
     assert fan_figure(nothing, outlines=outlines_of(nothing)).legends == []
+
+
+def test_names_may_hold_dollars(frames: SonarFrames) -> None:
+    named = replace(frames, shape_names=tuple(f"$^{name}$" for name in frames.shape_names))
+    figure = fan_figure(named, 3, title="a$^$b", outlines=outlines_of(named))
+    figure.savefig(io.BytesIO(), dpi=20)
+    assert figure.axes[0].get_title() == "a$^$b"
 
 
 def test_shapes_without_names_have_their_numbers(frames: SonarFrames) -> None:

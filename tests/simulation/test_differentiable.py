@@ -211,6 +211,14 @@ def test_properties_of_the_sonar_itself_change_nothing() -> None:
     np.testing.assert_allclose(changed, np.array(other.levels(POSE)), rtol=1e-4, atol=1e-6 * plain.max())
 
 
+def test_beams_have_their_width_without_a_pattern_over_elevation() -> None:
+    sonar = SONAR.replace(pattern="two_way", elevation_pattern="box")
+    loaded, width = built(), 1.5 * float(np.degrees(sonar.beam_width_rad))
+    levels = np.array(mitsonar.DifferentiableSimulator(loaded, sonar).levels(POSE, beam_width_deg=width))
+    other = np.array(mitsonar.DifferentiableSimulator(loaded, sonar.replace(beam_width_deg=width)).levels(POSE))
+    assert levels.sum() == pytest.approx(other.sum(), rel=0.01)
+
+
 @pytest.mark.parametrize("exponent", [0, 2])
 def test_another_sound_speed_moves_echoes_and_their_gain(exponent: int) -> None:
     """A small ball at 3.4 m appears where sound of 1500 m/s would come from, with the gain of that range."""
@@ -270,6 +278,11 @@ def test_what_it_cannot_do_is_refused() -> None:
     for name in ("beam_width_deg", "absorption_db_per_m"):
         with pytest.raises(MitsonarError, match=f"{name} needs a beam pattern"):
             simulator.levels(POSE, **{name: 1})
+    across = mitsonar.DifferentiableSimulator(loaded, SONAR.replace(pattern="two_way", elevation_pattern="box"))
+    upright = mitsonar.DifferentiableSimulator(loaded, SONAR.replace(pattern="box", elevation_pattern="two_way"))
+    for one, name in ((across, "elevation_fov_deg"), (upright, "beam_width_deg"), (upright, "absorption_db_per_m")):
+        with pytest.raises(MitsonarError, match=f"{name} needs a beam pattern"):
+            one.levels(POSE, **{name: 1})
     for value in (0.0, -1500.0, float("nan"), [1.0, 2.0]):
         with pytest.raises(MitsonarError, match="sound_speed must be one number of at least 1"):
             simulator.levels(POSE, sound_speed=value)
