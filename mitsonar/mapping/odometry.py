@@ -957,7 +957,7 @@ def height_profile(
     # 3. z of the ground needs a measured z of the sonar: odometry alone keeps its height constant
     nothing = np.full(len(frames), np.nan)
     depth = None if sensors is None else sensors.depths(path.time_s)
-    known = source.poses[frames, 2] if source.poses is not None else nothing if depth is None else poses[:, 2]
+    known = nothing if source.poses is None and depth is None else poses[:, 2]
     return HeightProfile(
         frames=frames,
         distance_m=np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))]),
