@@ -418,7 +418,8 @@ class FrameSource:
         poses = path.poses[there].copy()
         attitudes = self.attitudes(index)
         if attitudes is not None and (np.ptp(path.poses[:, 2:5], axis=0) < PLANAR).all():
-            poses[:, 3:5] = attitudes[:, 3:5]
+            known = np.isfinite(attitudes[:, 3:5]).all(axis=1)
+            poses[known, 3:5] = attitudes[known, 3:5]
         return index, poses
 
     def heights_along(self, index: Index, poses: Array) -> Array | None:

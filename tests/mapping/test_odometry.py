@@ -577,6 +577,12 @@ def test_a_planar_path_takes_the_frames_pitch_and_another_keeps_its_own() -> Non
     np.testing.assert_array_equal(source.along(Trajectory(local, path.time_s))[1], local)
     with pytest.raises(MitsonarError, match=r"no pose is within 0.01 s of a frame: give the path of this run"):
         source.along(Trajectory(path.poses, path.time_s + 100))
+    # the path's own where sensors miss a frame
+    lean = np.full((10, 3), 0.4)
+    lean[3] = np.nan
+    planar = Trajectory(path.poses * [1, 1, 0, 0, 0, 1], path.time_s)
+    _, poses = FrameSource.of(replace(frames, poses=None, attitude_rad=lean)).along(planar)
+    np.testing.assert_array_equal(poses[:, 3], np.where(np.arange(10) == 3, 0.0, 0.4))
 
 
 @pytest.mark.learn
