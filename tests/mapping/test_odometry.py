@@ -559,6 +559,9 @@ def test_geometry_is_given_where_it_lacks_and_only_there() -> None:
     leaning = FrameSource.of(replace(frames, attitude_rad=np.zeros((4, 3))))
     with pytest.warns(MitsonarWarning, match="replaces the pitch and roll of each frame"):
         leaning.with_geometry(pitch_rad=0.5)
+    some = np.array([[0.0, 0, 0], [np.nan] * 3, [0.1, 0, 0], [0.1, 0, np.nan]])
+    with pytest.warns(MitsonarWarning, match="replaces the pitch and roll of 3 of 4 frames, which sensors measured"):
+        FrameSource.of(replace(frames, attitude_rad=some)).with_geometry(pitch_rad=0.5)
 
 
 def test_a_planar_path_takes_the_frames_pitch_and_another_keeps_its_own() -> None:
