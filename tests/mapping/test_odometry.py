@@ -772,6 +772,21 @@ def test_another_odometry_is_not_gone_on_with(tmp_path: Path) -> None:
     run(out, path, overwrite=True)
 
 
+def test_a_journal_holds_what_estimators_of_users_report(tmp_path: Path) -> None:
+    """Numbers of NumPy, and a covariance that nothing uses since the motion is invalid."""
+    about = {"height_m": np.float32(2.5), "height_std_m": np.float64(0.1), "modes": np.eye(4)[:2]}
+    estimates = [
+        Estimate(Motion(0.1, 0.2, 0.3), np.eye(3), about=about),
+        Estimate(Motion(0.0, 0.0, 0.0), -np.eye(3), False, "nothing there"),
+    ]
+    for pair, estimate in enumerate(estimates):
+        odometry_run.add_to_journal(tmp_path / "journal", {"pair": pair}, estimate)
+    (_, first), (key, second) = odometry_run.read_journal(tmp_path / "journal", "pair")
+    assert first.about == {"height_m": 2.5, "height_std_m": 0.1, "modes": np.eye(4)[:2].tolist()}
+    assert key == {"pair": 1}
+    assert second.reason == "nothing there"
+
+
 @pytest.mark.usefixtures("no_picture")
 def test_folders_of_others_are_kept(tmp_path: Path) -> None:
     path = sway(20)
