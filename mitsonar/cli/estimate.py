@@ -577,8 +577,8 @@ def crlb(
                 )
             sounder = load_sounder(instrument).replace(**changes)
             fan = sounder.fan
-        count = poses or (20 if trajectory else None)
-        path = path_for(fan, attitude, source, count, start, end, trajectory, frame)
+        count = 20 if poses is None and trajectory else poses
+        path = path_for(fan, attitude, source, count, start, end, trajectory, frame, counted="--poses")
         if sounder is not None:
             path = under_vehicle(path, sounder, trajectory)
         portions = segments.split(",") if segments else []
