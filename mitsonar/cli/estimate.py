@@ -304,6 +304,12 @@ def mosaic(
     if ground_map.frames_without_ground:
         without, frames_added = ground_map.frames_without_ground, count_noun(ground_map.frames, "frame")
         warn(f"left out since they show no ground: {without:,} of {frames_added}")
+    if ground_map.frames_past_nadir:
+        past, of_all = ground_map.frames_past_nadir, count_noun(ground_map.frames, "frame")
+        warn(
+            f"in {past:,} of {of_all} the fan reaches past straight down, where an echo belongs to one of two places, ahead "
+            "or astern: the map shows it at both"
+        )
     if quality is None:
         save_geotiff(out, ground_map)
     else:
