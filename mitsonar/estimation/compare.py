@@ -660,9 +660,13 @@ def _bench(data: str, estimators: Estimators, options: ComparisonOptions) -> Ben
     recipe = DataStore.open(data).recipe
     modality = modality_of(recipe)
     methods = _methods(modality.estimators if estimators is None else estimators)
-    if not methods or (options.reference is not None and options.reference not in methods):
+    if not methods:
         raise MitsonarError(
-            f"{argument('reference')} must be one of {', '.join(methods) or 'the estimators'}: got {options.reference!r}"
+            f"{argument('estimators')} must name one or more: got none; leave it out for all without training"
+        )
+    if options.reference is not None and options.reference not in methods:
+        raise MitsonarError(
+            f"{argument('reference')} must be one of {', '.join(methods)}: got {options.reference!r}"
             f"{did_you_mean(options.reference, methods)}"
         )
     perturb, jitter, prior = (argument(name) for name in ("perturb", "jitter", "prior"))

@@ -153,6 +153,8 @@ def test_compare_in_python_is_the_table_of_the_command(
         compare(made, [Zero, Zero()], ComparisonOptions(part="all"))
     with pytest.raises(MitsonarError, match=r"^reference must be one of zero: got 'zeor'; did you mean zero\?"):
         compare(made, "zero", ComparisonOptions(part="all", reference="zeor"))
+    with pytest.raises(MitsonarError, match=r"^estimators must name one or more: got none"):
+        compare(made, ",", ComparisonOptions(part="all"))
 
 
 def test_a_folder_holds_the_estimates_of_its_estimators_only(made: Path, tmp_path: Path) -> None:
