@@ -538,8 +538,8 @@ def test_the_command_answers_the_buyer(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "output"),
     [
-        (["--gain", "-1"], "gain must be above 0 and finite: got -1"),
-        (["--gain", "nan"], "gain must be above 0 and finite: got nan"),
+        (["--gain", "-1"], "--gain must be above 0 and finite: got -1"),
+        (["--gain", "nan"], "--gain must be above 0 and finite: got nan"),
         (["--poses", "0"], "--poses must be at least 1: got 0"),
         (["--to", "1,0,2.5,35,0,0"], "--to needs --poses T, 2 or more: how many poses lie between"),
     ],
