@@ -135,20 +135,20 @@ INSTRUMENT = {"model": "--model", "seed": "--seed"}
 
 OPTIONS: dict[str, dict[str, str]] = {
     "render": INSTRUMENT,
-    "crlb": {**INSTRUMENT, "height_m": "--height"},
+    "crlb": {**INSTRUMENT, "height_m": "--height", "gain": "--gain"},
     "sound": INSTRUMENT,
     "serve": {**INSTRUMENT, "rate_hz": "--rate"},
     "impulse": {**INSTRUMENT, "velocity": "--velocity"},
     "sas": {"far_m": "--range", "ground_m": "--ground"},
     "image": {"range_bins": "--bins", "range_min": "--range", "range_max": "--range"},
-    "odometry": {**GEOMETRY, "every": "--every"},
+    "odometry": {**GEOMETRY, **{name: f"--{name}" for name in ("every", "closure", "smooth")}},
     "height": {"pitch_rad": "--pitch-deg", "pitch_deg": "--pitch-deg"},
     "heights": {**GEOMETRY, "cells": "--cells"},
     "mosaic": {**GEOMETRY, "cell_m": "--cell-mm", "centre_beams": "--centre-beams"},
     "compare": {
         "height_m": "NAME:height_m=METRES",
         "pitch_rad": "NAME:pitch_deg=DEGREES",
-        **{name: f"--{name}" for name in ("reference", "perturb", "jitter", "prior", "part", "split")},
+        **{name: f"--{name}" for name in ("estimators", "reference", "perturb", "jitter", "prior", "part", "split")},
     },
     "mesh": {"up": "--up", "scale": "--scale", "floor_m": "--floor-m", "reflectivity": "--reflectivity"},
     "import_scene": {"reflectivity": "--reflectivity", "seabed_z": "--seabed-z"},

@@ -304,6 +304,12 @@ def mosaic(
     if ground_map.frames_without_ground:
         without, frames_added = ground_map.frames_without_ground, count_noun(ground_map.frames, "frame")
         warn(f"left out since they show no ground: {without:,} of {frames_added}")
+    if ground_map.frames_past_nadir:
+        past, of_all = ground_map.frames_past_nadir, count_noun(ground_map.frames, "frame")
+        warn(
+            f"in {past:,} of {of_all} the fan reaches past straight down, where an echo belongs to one of two places, ahead "
+            "or astern: the map shows it at both"
+        )
     if quality is None:
         save_geotiff(out, ground_map)
     else:
@@ -577,8 +583,8 @@ def crlb(
                 )
             sounder = load_sounder(instrument).replace(**changes)
             fan = sounder.fan
-        count = poses or (20 if trajectory else None)
-        path = path_for(fan, attitude, source, count, start, end, trajectory, frame)
+        count = 20 if poses is None and trajectory else poses
+        path = path_for(fan, attitude, source, count, start, end, trajectory, frame, counted="--poses")
         if sounder is not None:
             path = under_vehicle(path, sounder, trajectory)
         portions = segments.split(",") if segments else []

@@ -77,15 +77,17 @@ def path_for(
     file: Path | None,
     frame: str,
     speed: float | None = None,
+    *,
+    counted: str = "--frames",
 ) -> Trajectory:
-    """Return the trajectory that the options define."""
+    """Return the trajectory that the options define; ``counted`` is the option that gives ``frames``."""
     from mitsonar.instruments.sonar import first_sweeps, frame_period_s, scans
     from mitsonar.motion.pose import Pose
     from mitsonar.motion.trajectory import Trajectory
     from mitsonar.simulation.scene import shipped_trajectory
 
     if frames is not None and frames < 1:
-        raise MitsonarError(f"--frames must be at least 1: got {frames}")
+        raise MitsonarError(f"{counted} must be at least 1: got {frames}")
     if speed is not None and (file is not None or end is None or not 0 < speed < 1e4):
         raise MitsonarError(
             f"--speed must be above 0 m/s, and needs --from and --to: got {speed:g}{' without --to' if end is None else ''}"
@@ -111,7 +113,8 @@ def path_for(
         rest = frames or 1  # poses of a vehicle at rest; those of a head that turns lie at the ends of its sweeps
         return Trajectory.between(begin, begin, rest + (rest > 1 and scans(sonar)), 1 / frame_period_s(sonar))
     if frames is None or (frames < 2 and not scans(sonar)):
-        raise MitsonarError("--to needs --frames T, 2 or more: how many frames lie between --from and --to")
+        many = counted.strip("-")
+        raise MitsonarError(f"--to needs {counted} T, 2 or more: how many {many} lie between --from and --to")
     ends, poses = (begin, Pose.from_degrees(last)), frames + 1 if scans(sonar) else frames
     distance_m = math.dist(ends[0][:3], ends[1][:3])
     if speed is not None and distance_m == 0:

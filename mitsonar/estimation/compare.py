@@ -10,7 +10,7 @@ import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, overload
@@ -36,7 +36,7 @@ from mitsonar.estimation.external import OwnEstimator
 from mitsonar.estimation.image.ping_groups import estimate_pair
 from mitsonar.estimation.named import EstimatorLike, create_estimator
 from mitsonar.io.files import read_json, read_npz, write_atomic, write_json
-from mitsonar.io.runs import RunDirectory, RunKind, digest, versions
+from mitsonar.io.runs import RunDirectory, RunKind, digest, plain_json, versions
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import AXES, MotionErrors, cluster_resamples, in_units, motion_errors
 from mitsonar.records.frames import SonarFrames
@@ -660,9 +660,13 @@ def _bench(data: str, estimators: Estimators, options: ComparisonOptions) -> Ben
     recipe = DataStore.open(data).recipe
     modality = modality_of(recipe)
     methods = _methods(modality.estimators if estimators is None else estimators)
-    if not methods or (options.reference is not None and options.reference not in methods):
+    if not methods:
         raise MitsonarError(
-            f"{argument('reference')} must be one of {', '.join(methods) or 'the estimators'}: got {options.reference!r}"
+            f"{argument('estimators')} must name one or more: got none; leave it out for all without training"
+        )
+    if options.reference is not None and options.reference not in methods:
+        raise MitsonarError(
+            f"{argument('reference')} must be one of {', '.join(methods)}: got {options.reference!r}"
             f"{did_you_mean(options.reference, methods)}"
         )
     perturb, jitter, prior = (argument(name) for name in ("perturb", "jitter", "prior"))
@@ -757,7 +761,14 @@ def _settings(bench: Bench, options: ComparisonOptions) -> PlainTable:
         "pairs": len(bench.numbers),
         "seed": options.seed,
         **({"networks": networks} if networks else {}),
+        "estimators": {name: _described(method) for name, method in bench.methods.items()},
     }
+
+
+def _described(method: AnyEstimator) -> PlainTable:
+    """Return the class and the options of an estimator: in a dictionary, its name may stand for any."""
+    options: PlainTable = asdict(method) if is_dataclass(method) else {}
+    return plain_json({"class": type(method).__name__, **{k: v for k, v in options.items() if k != "digest"}})
 
 
 def _variations(options: ComparisonOptions) -> list[str]:

@@ -344,7 +344,12 @@ def heights_csv(time_s: Array, estimates: list[HeightEstimate], true: Array | No
 
 
 def heights_lines(estimates: list[HeightEstimate], true: Array | None) -> list[str]:
-    """Return sentences on the heights of all frames; ``true`` holds the true heights ``(n,)`` [m], where known."""
+    """Return sentences on the heights of all frames.
+
+    Args:
+        estimates: of the frames.
+        true: true z ``(n,)`` [m], where known; it is no height if it is 0 or less, as below a surface at z = 0.
+    """
     valid = np.array([one.valid for one in estimates], dtype=bool)
     heights = np.array([one.height_m for one in estimates])[valid]
     lines = []
@@ -352,7 +357,7 @@ def heights_lines(estimates: list[HeightEstimate], true: Array | None) -> list[s
         lines.append(f"rejected, {sum(one.reason == reason for one in estimates):,} frames: {reason}")
     if len(heights):
         lines.append(f"height {heights.min():.3f} .. {heights.max():.3f} m, median {np.median(heights):.3f} m")
-    if true is not None and len(heights):
+    if true is not None and len(heights) and (true > 0).all():
         error = heights - true[valid]
         rmse, median = 100 * np.sqrt((error**2).mean()), 100 * np.median(np.abs(error))
         lines.append(f"against the true z: RMSE {rmse:.2f} cm, median {median:.2f} cm, bias {100 * error.mean():+.2f} cm")

@@ -775,11 +775,14 @@ def _unsure(frames: SonarFrames) -> tuple[Apart, Apart]:
 
 
 def _pitch_roll(frames: SonarFrames) -> NDArray[np.float64] | None:
-    """Return the pitch and roll of each frame ``(frames, 2)`` from poses or the sonar's sensors; None if unknown."""
+    """Return the pitch and roll of each frame ``(frames, 2)`` from poses or the sonar's sensors; None if unknown.
+
+    The roll does not jump by a full turn where a sonar that is mounted upside down leans to either side.
+    """
     table, columns = (frames.attitude_rad, slice(0, 2)) if frames.poses is None else (frames.poses, slice(3, 5))
     if table is None or not np.isfinite(table[:, columns]).all():
         return None
-    return np.asarray(table[:, columns])
+    return np.unwrap(table[:, columns], axis=0)
 
 
 def _mean(values: NDArray[np.float64] | None) -> float | None:

@@ -494,7 +494,8 @@ def map_attitudes(source: FrameSource, numbers: Index) -> tuple[Array, Array]:
         table[:, 2] -= ground
         table[0, 5] = poses[0, 5]
         return table, ATTITUDE_STD
-    table[:, 2] = percentile_filter(heights, 90, size=min(HEIGHT_FRAMES, len(heights)), mode="nearest")
+    rise = 0.0 if source.rise_m is None else source.rise_m[numbers]
+    table[:, 2] = rise + percentile_filter(heights - rise, 90, size=min(HEIGHT_FRAMES, len(heights)), mode="nearest")
     measured = None if source.attitude_rad is None else source.attitude_rad[numbers, :2]
     if source.pitch_rad is not None:
         table[:, 3] = source.pitch_rad

@@ -139,6 +139,8 @@ class Mosaic:
         """Number of frames added."""
         self.frames_without_ground = 0
         """Number of these that showed no ground: height unknown (nan), or ground outside the window or field of view."""
+        self.frames_past_nadir = 0
+        """Number of these that look past straight down, where an echo belongs to one of two places, and is laid at both."""
         self._box = Box(0, 0, 0, 0)
         self._sums = np.zeros((len(CellSums._fields), 0, 0), np.float32)
 
@@ -219,6 +221,7 @@ class Mosaic:
         for image, pose, height, all_beams in zip(images, table, heights, entire, strict=True):
             fan = fan_of(frames, pose, height)
             self.frames += 1
+            self.frames_past_nadir += bool(fan.ground.pitch_rad + fan.half_elevation > math.pi / 2)
             if self.options.blend == "centre" and not all_beams:
                 fan, image = middle_beams(fan, image, self.options.centre_beams)
             if not self._lay(image, fan, pose):

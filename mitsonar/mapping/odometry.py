@@ -70,6 +70,7 @@ __all__ = [
     "loop_starts",
     "normalised_errors",
     "odometry",
+    "off_compass",
     "series_of",
 ]
 
@@ -185,12 +186,14 @@ def odometry(
     series = {"none": bridged, "spline": spline_smoothed, "kalman": kalman_smoothed}[options.smooth](measured)
     path = path_of(series.motions, first, series.time_s)
     # 5. with sensors or loops, the pose graph replaces this path
-    graph = None
+    graph, start_known = None, options.start is not None or source.poses is not None
+    if not doubt and sensors is not None and start_known:
+        doubt = off_compass(sensors, path)
     if sensors is not None or options.loops:
         graph = graph_path(
             measured,
             first,
-            start_known=options.start is not None or source.poses is not None,
+            start_known=start_known,
             sensors=sensors,
             search=None if not options.loops or shown is None else partial(search_loops, shown, estimator, numbers, store),
             source=shown,
@@ -708,6 +711,31 @@ def follows_depth(estimates: Sequence[Estimate], rise_m: Array, name: str) -> st
     return f"motions ahead follow the depth of {name}, by {slope:.2g} m for each metre that it rises: {cause}"
 
 
+FIRST_HEADINGS, OFF_COMPASS = 20, 5.0
+"""Readings of a compass that are compared with the first heading, and the standard deviations by which they may differ."""
+
+
+def off_compass(sensors: VehicleSensors, path: Trajectory) -> str:
+    """Return a sentence where the compass contradicts a known first heading, by which the path would twist; else nothing.
+
+    Args:
+        sensors: sensors of the vehicle.
+        path: path of the motions alone, from the known first pose.
+    """
+    headings = sensors.headings(path.time_s)
+    if not headings.pose.size:
+        return ""
+    first = slice(FIRST_HEADINGS)
+    off = headings.heading[first] - path.poses[headings.pose[first], 5]
+    turn = float(np.angle(np.exp(1j * off).mean()))
+    if abs(turn) <= OFF_COMPASS * float(np.median(headings.std[first])):
+        return ""
+    return (
+        f"the compass of {sensors.name} is {np.degrees(turn):+.0f} deg off the first heading, so that the path twists until "
+        "both agree: give a first pose with the heading of the compass, correct its declination, or leave it out"
+    )
+
+
 WRONG_ROLL = "vehicle_roll_deg seems to have the wrong sign, since it is positive with starboard down"
 
 
@@ -957,7 +985,7 @@ def height_profile(
     # 3. z of the ground needs a measured z of the sonar: odometry alone keeps its height constant
     nothing = np.full(len(frames), np.nan)
     depth = None if sensors is None else sensors.depths(path.time_s)
-    known = source.poses[frames, 2] if source.poses is not None else nothing if depth is None else poses[:, 2]
+    known = nothing if source.poses is None and depth is None else poses[:, 2]
     return HeightProfile(
         frames=frames,
         distance_m=np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))]),

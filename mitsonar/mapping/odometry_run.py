@@ -338,9 +338,14 @@ def add_to_journal(path: Path, key: PlainTable, estimate: Estimate) -> None:
     motion = [float(value) for value in estimate.motion]
     line = key | {"motion": motion, "covariance": covariance, "valid": bool(estimate.valid)}
     about = {name: estimate.about[name] for name in ("modes", "spreads", *HEIGHTS, *SENTENCES) if name in estimate.about}
-    text = json.dumps(line | {"reason": estimate.reason} | ({"about": about} if about else {})) + "\n"
+    # estimators of users may report numbers and arrays of NumPy
+    text = json.dumps(line | {"reason": estimate.reason} | ({"about": about} if about else {}), default=_of_numpy)
     with path.open("a", encoding="utf-8", newline="\n") as file:
-        file.write(text)
+        file.write(f"{text}\n")
+
+
+def _of_numpy(value: np.ndarray | np.generic) -> object:
+    return value.tolist()
 
 
 def read_journal(path: Path, *names: str) -> Iterator[tuple[PlainTable, Estimate]]:
@@ -370,7 +375,7 @@ def _estimate_in(line: bytes, names: tuple[str, ...]) -> tuple[PlainTable, Estim
         raise ValueError("motion, reason or valid is of another type")
     if table["valid"] and not np.isfinite(motion).all():
         raise ValueError("the motion is not finite")
-    if covariance is not None and (covariance.shape != (3, 3) or (np.diagonal(covariance) < 0).any()):
+    if covariance is not None and (covariance.shape != (3, 3) or (table["valid"] and (np.diagonal(covariance) < 0).any())):
         raise ValueError("covariance is not a covariance")
     about = table.get("about", {})
     if not isinstance(about, dict):

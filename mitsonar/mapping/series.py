@@ -24,6 +24,7 @@ from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 
 __all__ = [
+    "LET_IT_TURN",
     "CorrelatedErrors",
     "Ellipse",
     "ErrorCorrelation",
@@ -532,12 +533,17 @@ def _innovations(seen: Array, noise: Array, gap: Array, walk: Array) -> tuple[Ar
     return log_spread, chi
 
 
+LET_IT_TURN = "an estimator that takes the heading as constant states none for yaw: let it turn, as likelihood:yaw=1"
+"""What to do where a covariance has no variance of yaw."""
+
+
 def _variances(measured: MotionSeries) -> Array:
     """Return the variances of the motions ``(frames - 1, 3)``, checked to be positive where valid."""
     variance = np.diagonal(np.asarray(measured.covariances), axis1=1, axis2=2)
     for axis, values in zip(AXES, variance[measured.is_valid].T, strict=True):
         if not (values > 0).all():
-            raise MitsonarError(f"smoothing needs variances above zero: got {values.min():g} for {axis.name}")
+            hint = f"; {LET_IT_TURN}" if axis.name == "yaw" else ""
+            raise MitsonarError(f"smoothing needs variances above zero: got {values.min():g} for {axis.name}{hint}")
     return variance
 
 

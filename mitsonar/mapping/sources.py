@@ -216,9 +216,11 @@ class FrameSource:
                 f"{self.name}: the frames have a pitch, so that {np.degrees(pitch_rad):g} deg would not be used: leave "
                 "it out, or give it to the estimator, as NAME:pitch_deg=35"
             )
-        if pitch_rad is not None and self.attitude_rad is not None and np.isfinite(self.attitude_rad[:, :2]).all():
+        lean = np.zeros((0, 2)) if self.attitude_rad is None else self.attitude_rad[:, :2]
+        if pitch_rad is not None and (count := int(np.isfinite(lean).all(axis=1).sum())):
+            frames = "each frame" if count == len(lean) else f"{count:,} of {count_noun(len(lean), 'frame')}"
             warnings.warn(
-                f"{self.name}: a pitch of {np.degrees(pitch_rad):g} deg replaces the pitch and roll of each frame, which "
+                f"{self.name}: a pitch of {np.degrees(pitch_rad):g} deg replaces the pitch and roll of {frames}, which "
                 "sensors measured: leave it out to use them",
                 MitsonarWarning,
                 stacklevel=3,
@@ -418,7 +420,8 @@ class FrameSource:
         poses = path.poses[there].copy()
         attitudes = self.attitudes(index)
         if attitudes is not None and (np.ptp(path.poses[:, 2:5], axis=0) < PLANAR).all():
-            poses[:, 3:5] = attitudes[:, 3:5]
+            known = np.isfinite(attitudes[:, 3:5]).all(axis=1)
+            poses[known, 3:5] = attitudes[known, 3:5]
         return index, poses
 
     def heights_along(self, index: Index, poses: Array) -> Array | None:

@@ -180,7 +180,10 @@ class Trajectory:
         return cls(poses_by_frame[frame], table[:, 0])
 
     def save(self, path: str | Path, frame: str = "mitsonar") -> None:
-        """Write a TUM file, or a CSV file if the name ends with ``.csv``. :meth:`load` reads it back to 1e-9 m and deg.
+        """Write a TUM file, or a CSV file if the name ends with ``.csv``.
+
+        :meth:`load` reads it back to 1e-9 m and deg. Quaternions of TUM files have nine decimals: attitudes come back to
+        2e-6 deg.
 
         Args:
             path: path of the file, which is replaced.
@@ -211,7 +214,7 @@ class Trajectory:
         return cls(_poses_from_quaternions(table, CONVENTIONS["mitsonar"]), table[:, 0])
 
     def save_tum(self, path: str | Path) -> None:
-        """Write a TUM file in the convention of mitsonar. :meth:`load_tum` reads it back to 1e-9."""
+        """Write a TUM file in the convention of mitsonar; see :meth:`save`."""
         quaternions = vehicle_rotation(self.poses).as_quat(canonical=True)
         write_tum(path, np.column_stack([self.time_s, self.poses[:, :3], quaternions]), CONVENTIONS["mitsonar"])
 
@@ -523,7 +526,7 @@ class Convention:
         return world.apply(position), world * rotation * body
 
     def from_mitsonar(self, position: Table, rotation: Rotation) -> tuple[Table, Rotation]:
-        """Convert positions and attitudes from the convention of mitsonar, the inverse of :meth:`to_ours`."""
+        """Convert positions and attitudes from the convention of mitsonar, the inverse of :meth:`to_mitsonar`."""
         world, body = Rotation.from_matrix(self.world), Rotation.from_matrix(self.body)
         return world.inv().apply(position), world.inv() * rotation * body.inv()
 
@@ -537,7 +540,7 @@ class Convention:
         return np.asarray((angles - (0, 0, self.north)) * self.signs)
 
     def angles_from_mitsonar(self, angles: Table) -> Table:
-        """Convert angles from the convention of mitsonar, the inverse of :meth:`angles_to_ours`."""
+        """Convert angles from the convention of mitsonar, the inverse of :meth:`angles_to_mitsonar`."""
         return np.asarray(angles * self.signs + (0, 0, self.north))
 
 

@@ -42,6 +42,7 @@ from mitsonar.estimation.compare import (  # noqa: E402  # noqa: E402
 )
 from mitsonar.estimation.estimator import Estimate  # noqa: E402
 from mitsonar.estimation.image.direct import Direct  # noqa: E402
+from mitsonar.estimation.image.phase import Ecc  # noqa: E402
 from mitsonar.estimation.named import (  # noqa: E402
     Zero,
     create_estimator,
@@ -152,6 +153,19 @@ def test_compare_in_python_is_the_table_of_the_command(
         compare(made, [Zero, Zero()], ComparisonOptions(part="all"))
     with pytest.raises(MitsonarError, match=r"^reference must be one of zero: got 'zeor'; did you mean zero\?"):
         compare(made, "zero", ComparisonOptions(part="all", reference="zeor"))
+    with pytest.raises(MitsonarError, match=r"^estimators must name one or more: got none"):
+        compare(made, ",", ComparisonOptions(part="all"))
+
+
+def test_a_folder_holds_the_estimates_of_its_estimators_only(made: Path, tmp_path: Path) -> None:
+    """Another estimator under the same name must not get the estimates of the first."""
+    options = ComparisonOptions(part="all", limit=0, pairs=2)
+    compare(made, {"mine": Zero()}, options, out=tmp_path / "out")
+    with pytest.raises(MitsonarError, match="class Zero, not Ecc"):
+        compare(made, {"mine": Ecc()}, options, out=tmp_path / "out")
+    compare(made, {"mine": Direct(height_m=2.0)}, options, out=tmp_path / "other")
+    with pytest.raises(MitsonarError, match=r"begun with estimators\.mine\.height_m 2\.0, not 3\.0"):
+        compare(made, {"mine": Direct(height_m=3.0)}, options, out=tmp_path / "other")
 
 
 def test_a_network_gets_the_input_of_its_training(pairs: SonarPairs) -> None:

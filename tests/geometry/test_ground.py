@@ -140,6 +140,15 @@ def test_each_frame_has_its_own_height_pitch_and_roll() -> None:
     assert result.ground(frames).pitch_rad == pytest.approx(0.61)
 
 
+def test_a_sonar_upside_down_rolls_about_half_a_turn() -> None:
+    """Its roll jumps from 180 to -180 deg, whose mean is not 0."""
+    frames, _, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD)
+    poses = np.array([[0, 0, 2.0, 0.6, np.pi - 0.02, 0], [0, 0, 2.0, 0.6, -np.pi + 0.04, 0]])
+    result = attitude_of(replace(frames, poses=poses), "a test", None, None)
+    assert result.roll_rad == pytest.approx(np.pi + 0.01)
+    assert [result.of_frame(k)[2] for k in range(2)] == pytest.approx([np.pi - 0.02, np.pi + 0.04])
+
+
 @pytest.mark.parametrize(("given_m", "told"), [(2500.0, True), (0.5, True), (HEIGHT_M, False), (None, False)])
 def test_a_height_beyond_both_ends_of_rising_ground_is_told(given_m: float | None, told: bool) -> None:
     """A height in millimetres, say: the ends of the light count, and the contradiction is reported."""

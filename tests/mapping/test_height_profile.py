@@ -44,6 +44,17 @@ def profile_of(source: FrameSource, *heights: float | None, depth: bool = False)
     return height_profile(source, np.arange(len(source)), estimates, sensors, path)
 
 
+def test_ground_lies_below_a_path_that_starts_elsewhere_than_the_true_one(source: FrameSource) -> None:
+    """The z of the ground belongs to x and y beside it: to the path, not to the poses of the frames."""
+    true = source.true
+    assert true is not None
+    still = [Estimate(Motion(0.0, 0.0, 0.0))] * (COUNT - 1)
+    moved = Trajectory(true.poses + np.array([10.0, 20.0, 30.0, 0, 0, 0]), true.time_s)
+    here, there = (height_profile(source, np.arange(COUNT), still, None, path) for path in (true, moved))
+    np.testing.assert_allclose(there.places - here.places, np.tile([10.0, 20.0], (COUNT, 1)))
+    np.testing.assert_allclose(there.ground_z_m - here.ground_z_m, 30.0)
+
+
 def test_first_echoes_come_before_an_altimeter_and_lie_ahead(source: FrameSource) -> None:
     assert source.poses is not None
     assert source.height_m is not None

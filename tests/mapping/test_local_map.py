@@ -23,6 +23,7 @@ from mitsonar.mapping.series import MotionSeries, path_of, pose_covariances
 from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.pose import Pose
+from mitsonar.motion.sensors import Readings, VehicleSensors
 from mitsonar.records.frames import SonarFrames
 
 FRAMES, STEP_M = 48, 0.02
@@ -114,6 +115,16 @@ def test_heave_that_no_sensor_tells_is_estimated(monkeypatch: pytest.MonkeyPatch
         result = mapped(blind, np.arange(FRAMES), wrong_estimates())
         errors.append(abs(sum(one.motion.forward for one in result) - STEP_M * (FRAMES - 1)))
     assert errors[0] < 0.5 * errors[1], "heave changes the length of the path where it is not estimated"
+
+
+def test_heave_by_a_depth_sensor_moves_the_sonar_and_not_the_ground() -> None:
+    frames = replace(run(), poses=None, height_m=None)
+    rise = 0.2 * np.sin(np.arange(FRAMES) / 4)
+    depth = Readings(frames.time_s, 10 - rise, np.full(FRAMES, 1e-3))
+    source = FrameSource.of(frames).with_geometry(2.5, np.radians(35)).with_sensors(VehicleSensors(depth=depth))[0]
+    assert source.rise_m is not None
+    table, _ = local_map.map_attitudes(source, np.arange(FRAMES))
+    np.testing.assert_allclose(table[:, 2], 2.5 + source.rise_m - source.rise_m.mean())
 
 
 def test_a_window_s_covariance_is_shared_among_motions_that_add_up_to_it() -> None:

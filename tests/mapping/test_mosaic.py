@@ -411,6 +411,17 @@ def test_cells_far_too_small_are_refused_before_they_fill_the_memory() -> None:
         Mosaic(MosaicOptions(1e-6)).add(blank([looking(0)]))
 
 
+def test_echoes_of_a_sonar_that_looks_down_lie_ahead_and_astern() -> None:
+    """A cell shows two places, and nothing tells which: such frames are counted."""
+    sonar = SONAR.replace(range_min=2.6, range_max=4, elevation_fov_deg=60)
+    frames = frames_of(lambda x, y: np.where(y > 1, 1.0, 0.2), [0, 0, HEIGHT, np.pi / 2, 0, 0], sonar)
+    below = build_mosaic(frames)
+    _, _, south, north = below.extent
+    assert (below.frames_past_nadir, north) == (1, pytest.approx(-south, abs=0.02))
+    assert np.isfinite(below.mean[[len(below.mean) // 8, -len(below.mean) // 8], below.mean.shape[1] // 2]).all()
+    assert build_mosaic(frames_of(lambda x, y: 0 * x + 1, [0, 0, HEIGHT, 0.6, 0, 0])).frames_past_nadir == 0
+
+
 def test_frames_without_ground_are_counted() -> None:
     high = Pose.from_degrees([0, 0, 9, 35, 0, 0])
     frames = blank([looking(0), high, looking(0)])

@@ -559,6 +559,9 @@ def test_geometry_is_given_where_it_lacks_and_only_there() -> None:
     leaning = FrameSource.of(replace(frames, attitude_rad=np.zeros((4, 3))))
     with pytest.warns(MitsonarWarning, match="replaces the pitch and roll of each frame"):
         leaning.with_geometry(pitch_rad=0.5)
+    some = np.array([[0.0, 0, 0], [np.nan] * 3, [0.1, 0, 0], [0.1, 0, np.nan]])
+    with pytest.warns(MitsonarWarning, match="replaces the pitch and roll of 3 of 4 frames, which sensors measured"):
+        FrameSource.of(replace(frames, attitude_rad=some)).with_geometry(pitch_rad=0.5)
 
 
 def test_a_planar_path_takes_the_frames_pitch_and_another_keeps_its_own() -> None:
@@ -577,6 +580,12 @@ def test_a_planar_path_takes_the_frames_pitch_and_another_keeps_its_own() -> Non
     np.testing.assert_array_equal(source.along(Trajectory(local, path.time_s))[1], local)
     with pytest.raises(MitsonarError, match=r"no pose is within 0.01 s of a frame: give the path of this run"):
         source.along(Trajectory(path.poses, path.time_s + 100))
+    # the path's own where sensors miss a frame
+    lean = np.full((10, 3), 0.4)
+    lean[3] = np.nan
+    planar = Trajectory(path.poses * [1, 1, 0, 0, 0, 1], path.time_s)
+    _, poses = FrameSource.of(replace(frames, poses=None, attitude_rad=lean)).along(planar)
+    np.testing.assert_array_equal(poses[:, 3], np.where(np.arange(10) == 3, 0.0, 0.4))
 
 
 @pytest.mark.learn
@@ -761,6 +770,21 @@ def test_another_odometry_is_not_gone_on_with(tmp_path: Path) -> None:
     with pytest.raises(MitsonarError, match=r"estimates.jsonl, line 1 is damaged"):
         run(out, path, resume=True)
     run(out, path, overwrite=True)
+
+
+def test_a_journal_holds_what_estimators_of_users_report(tmp_path: Path) -> None:
+    """Numbers of NumPy, and a covariance that nothing uses since the motion is invalid."""
+    about = {"height_m": np.float32(2.5), "height_std_m": np.float64(0.1), "modes": np.eye(4)[:2]}
+    estimates = [
+        Estimate(Motion(0.1, 0.2, 0.3), np.eye(3), about=about),
+        Estimate(Motion(0.0, 0.0, 0.0), -np.eye(3), False, "nothing there"),
+    ]
+    for pair, estimate in enumerate(estimates):
+        odometry_run.add_to_journal(tmp_path / "journal", {"pair": pair}, estimate)
+    (_, first), (key, second) = odometry_run.read_journal(tmp_path / "journal", "pair")
+    assert first.about == {"height_m": 2.5, "height_std_m": 0.1, "modes": np.eye(4)[:2].tolist()}
+    assert key == {"pair": 1}
+    assert second.reason == "nothing there"
 
 
 @pytest.mark.usefixtures("no_picture")

@@ -375,3 +375,10 @@ def test_what_slopes_are_over_adds_up_to_the_path() -> None:
     np.testing.assert_allclose(sloped.sum(axis=0), noisy.sum(axis=0), atol=1e-12)
     assert np.abs(sloped[440:460] - moved[440:460])[:, :2].max() < 4e-4
     assert sloped[600, 2] == pytest.approx(np.pi / 2, rel=0.15)
+
+
+def test_a_motion_without_freedom_names_the_estimator_s_option() -> None:
+    """As `likelihood` states it for impulse responses, where it takes the heading as constant."""
+    edges = PoseEdges.chain(np.zeros((2, 3)), np.tile(np.diag([1e-6, 1e-6, 0.0]), (2, 1, 1)))
+    with pytest.raises(MitsonarError, match=r"positive definite: got one that is not; .* likelihood:yaw=1"):
+        _ = edges.whitening

@@ -18,9 +18,9 @@ from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.estimator import Estimate, prior_rejection
 from mitsonar.geometry.ground import UNKNOWN_PER_S, USUAL_LEAN_RAD, attitude_of
 from mitsonar.instruments.sonar import Sonar
-from mitsonar.mapping.odometry import contradiction, follows_depth, graph_path
+from mitsonar.mapping.odometry import contradiction, follows_depth, graph_path, off_compass
 from mitsonar.mapping.sensors import SensorNoise, open_sensors, simulated_sensors
-from mitsonar.mapping.series import MotionSeries
+from mitsonar.mapping.series import MotionSeries, path_of
 from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.pose import Pose, mounted
@@ -511,6 +511,22 @@ def test_motions_that_follow_the_depth_are_doubted(slope: float, cause: str) -> 
     assert cause in doubt
     assert (doubt == "") == (cause == "")
     assert follows_depth(estimates[:9], rise[:10], "s.csv") == ""
+
+
+def test_a_compass_off_the_known_first_heading_is_doubted() -> None:
+    """The path would twist towards the compass within some frames: 60 deg, though no motion turns."""
+    count = 100
+    time_s, noise = np.arange(count) * 0.1, np.radians(1)
+    values = np.radians(179) + noise * np.random.default_rng(0).normal(size=count)
+    sensors = VehicleSensors(heading=Readings(time_s, values, np.full(count, noise)), name="the sensors of dive.csv")
+    moved, covariance = np.tile([0, 0.03, 0], (count - 1, 1)), np.diag([1e-3, 1e-3, np.radians(0.05)]) ** 2
+    for heading_deg, cause in ((119.0, r"the compass of the sensors of dive.csv is \+60 deg off the first"), (-180.0, "^$")):
+        start = Pose.from_degrees([0, 0, 2, 0, 0, heading_deg])
+        assert re.search(cause, off_compass(sensors, path_of(moved, start, time_s)))
+        series = MotionSeries(moved, time_s, np.tile(covariance, (count - 1, 1, 1)))
+        path = graph_path(series, start, start_known=True, sensors=sensors, search=None, source=None).path
+        assert (np.ptp(path.poses[:20, 5]) > np.radians(30)) == (heading_deg > 0)
+    assert not off_compass(VehicleSensors(depth=Readings(time_s, time_s, np.ones(count))), path)
 
 
 def test_a_gyroscope_without_the_roll_of_the_vehicle_counts_little() -> None:

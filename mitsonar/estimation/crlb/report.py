@@ -70,7 +70,7 @@ class BoundOptions:
         largest: largest standard deviations that count as an observation, where ``degrees`` differ from the usual three.
 
     Raises:
-        MitsonarError: an unknown noise, or a height that is not above 0.
+        MitsonarError: an unknown noise, or a height or gain that is not above 0.
     """
 
     noise: str | None = None
@@ -86,6 +86,8 @@ class BoundOptions:
         load_noise(self.noise or "none")
         if self.height_m is not None and not self.height_m > 0:
             raise MitsonarError(f"{argument('height_m')} must be above 0: got {self.height_m:g} m")
+        if self.gain is not None and not 0 < self.gain < np.inf:
+            raise MitsonarError(f"{argument('gain')} must be above 0 and finite: got {self.gain:g}")
 
     def noise_for(self, sonar: Sonar) -> NoiseModel:
         """Return the noise of the pixels of a sonar.

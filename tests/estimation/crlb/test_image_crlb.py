@@ -535,6 +535,24 @@ def test_the_command_answers_the_buyer(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize(
+    ("words", "output"),
+    [
+        (["--gain", "-1"], "--gain must be above 0 and finite: got -1"),
+        (["--gain", "nan"], "--gain must be above 0 and finite: got nan"),
+        (["--poses", "0"], "--poses must be at least 1: got 0"),
+        (["--to", "1,0,2.5,35,0,0"], "--to needs --poses T, 2 or more: how many poses lie between"),
+    ],
+)
+def test_the_command_refuses_what_it_cannot_compute(tmp_path: Path, words: list[str], output: str) -> None:
+    path = tmp_path / "floor.xml"
+    path.write_text(SCENE)
+    code, text = command(path, *words)
+    assert code == 2
+    assert output in " ".join(text.split())
+
+
+@pytest.mark.usefixtures("variant")
 @pytest.mark.slow
 def test_the_command_reads_data_sets(tmp_path: Path) -> None:
     from helpers import tiny_recipe

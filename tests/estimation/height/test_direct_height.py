@@ -18,7 +18,7 @@ from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.height import DirectHeight, FloorProfile
+from mitsonar.estimation.height import DirectHeight, FloorProfile, HeightEstimate, heights_lines
 from mitsonar.estimation.named import height_estimator_from
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
@@ -162,6 +162,13 @@ def test_heights_of_a_data_set_s_vectors(heights: Path, tmp_path: Path, mitsonar
     refused(mitsonar("height", heights, "-o", tmp_path / "heights.csv"), "exists and is kept as it is")
     refused(mitsonar("height", heights, "--by", "directly"), "a height estimator is direct, a checkpoint")
     refused(mitsonar("height", heights, "--view", "q1"), "has no vectors of view 'q1'")
+
+
+def test_a_depth_is_no_height_to_compare_with() -> None:
+    """The z of a sonar below a surface at z = 0, as in recordings, says nothing about the height over the ground."""
+    estimates = [HeightEstimate(1.8, 0.1), HeightEstimate(1.9, 0.1)]
+    assert "against the true z: RMSE 10.00 cm" in heights_lines(estimates, np.array([1.7, 1.8]))[-1]
+    assert heights_lines(estimates, np.array([-10.3, -10.2])) == heights_lines(estimates, None)
 
 
 def test_measured_heights_hide_the_true_ones() -> None:
