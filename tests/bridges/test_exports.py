@@ -289,7 +289,7 @@ def test_neusis_warns_of_beams_that_it_places_elsewhere(
     frames: SonarFrames, tmp_path: Path, layout: str, first: int, warns: bool
 ) -> None:
     bearing = SONAR.replace(beam_layout=layout).bearing_rad[first:]
-    named = {"shape_id": None, "object_id": None, "shape_names": (), "object_names": ()}
+    named: dict[str, Any] = {"shape_id": None, "object_id": None, "shape_names": (), "object_names": ()}
     moved = replace(frames, image=frames.image[:, :, first:], bearing_rad=bearing, **named)
     moved.save(tmp_path / "frames.npz")
     with warnings.catch_warnings(record=True) as caught:

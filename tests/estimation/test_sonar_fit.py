@@ -249,7 +249,7 @@ def test_one_small_frame_is_not_called_clipped() -> None:
 def test_known_fields_are_not_fitted() -> None:
     sonar = Sonar.create(beams=16, range_bins=96, frequency_hz=1.8e6, coding="linear")
     level = 0.01 * np.random.default_rng(2).exponential(size=(1, 96, 16))
-    known = {"noise_level_db": -50.0, "stripes_db": 1.5, "speckle_nu": 3.0, "near_glow_db": 5.0}
+    known: dict[str, Any] = {"noise_level_db": -50.0, "stripes_db": 1.5, "speckle_nu": 3.0, "near_glow_db": 5.0}
     fit = fit_sonar(SonarFrames(level, sonar.range_m, sonar.bearing_rad, np.zeros(1), sonar), **known).sonar
     assert {name: getattr(fit, name) for name in known} == known
 

@@ -516,8 +516,8 @@ def test_motions_that_follow_the_depth_are_doubted(slope: float, cause: str) -> 
 def test_a_compass_off_the_known_first_heading_is_doubted() -> None:
     """The path would twist towards the compass within some frames: 60 deg, though no motion turns."""
     count = 100
-    time_s, noise = np.arange(count) * 0.1, np.radians(1)
-    values = np.radians(179) + noise * np.random.default_rng(0).normal(size=count)
+    time_s, noise = np.arange(count, dtype=np.float64) * 0.1, math.radians(1)
+    values = math.radians(179) + noise * np.random.default_rng(0).normal(size=count)
     sensors = VehicleSensors(heading=Readings(time_s, values, np.full(count, noise)), name="the sensors of dive.csv")
     moved, covariance = np.tile([0, 0.03, 0], (count - 1, 1)), np.diag([1e-3, 1e-3, np.radians(0.05)]) ** 2
     for heading_deg, cause in ((119.0, r"the compass of the sensors of dive.csv is \+60 deg off the first"), (-180.0, "^$")):
