@@ -191,7 +191,7 @@ class ExpectedFormer:
             elevation_fov_deg=elevation,
             beams=beams,
             beam_width_deg=None,
-            range_min=sonar.range_min - before * sonar.bin_m,
+            range_min=max(0.0, sonar.range_min - before * sonar.bin_m),  # not -1e-17 by rounding
             range_max=sonar.range_max + after * sonar.bin_m,
             range_bins=sonar.range_bins + before + after,
             **given,
