@@ -249,7 +249,7 @@ def test_warned_of_returns_outside_the_window(flat: mi.Scene) -> None:
 class _Seen:
     """A source whose worst frame lost returns at 6..7 m."""
 
-    def window_range(self, pose: object, number: int) -> tuple[float, float]:
+    def window_range(self, pose: object, number: int, time_s: float) -> tuple[float, float]:
         return 6.0, 7.0
 
 
@@ -258,7 +258,7 @@ def test_a_negligible_share_outside_the_window_is_not_warned_of(outside: int, wa
     """Up to a thousandth of the returns."""
     rays = {"inside": 21_299_182 - outside, "nearer": 0, "farther": outside, "missed": 0}
     tally = Tally(SMALL, frames=1, rays=rays, pixels=100, filled=100, worst=(outside, 0))
-    assert ("window" in tally.findings(_Seen(), np.zeros((1, 6)))) == warned
+    assert ("window" in tally.findings(_Seen(), np.zeros((1, 6)), np.zeros(1))) == warned
 
 
 def test_warned_of_saturation(flat: mi.Scene) -> None:
