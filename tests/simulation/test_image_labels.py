@@ -93,3 +93,17 @@ def test_a_floor_below_all_echoes_leaves_the_shadows_of_ping_groups_with_a_patte
     assert plain.shadow is not None
     assert set(np.unique(plain.shadow)) == {0, 1, 2}
     np.testing.assert_array_equal(above.shadow, plain.shadow)
+
+
+@pytest.mark.parametrize("undone", [False, True])
+@pytest.mark.parametrize("model", ["physical", "coherent"])
+def test_labels_are_of_what_absorption_leaves(model: str, undone: bool) -> None:
+    """Expected levels, to which a label floor is compared, fall by 2 dB/m there and back unless the gain undoes it."""
+    clear = LABELLED.replace(
+        model=model, pattern="two_way", frequency_hz=7e5, absorption_db_per_m=0.0, rays_per_beam=200, range_bins=64
+    )
+    dim = clear.replace(absorption_db_per_m=2.0, gain_absorption=undone)
+    loaded = scene(floor=floor(diffuse(0.4)))
+    pings, lossless = (next(Simulator(loaded, sonar).pings(POSE, labels=True)) for sonar in (dim, clear))
+    left = np.ones(64) if undone else 10 ** (-0.4 * dim.range_m)
+    np.testing.assert_allclose(pings.echoes[0], lossless.echoes[0] * left[:, None], rtol=1e-5)

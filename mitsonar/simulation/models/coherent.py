@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.water import gain_of, loss_notes, loss_of, sonar_absorption
+from mitsonar.acoustics.water import gain_of, loss_notes, loss_of, net_loss, sonar_absorption
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Quality, Sonar
 from mitsonar.instruments.views import CONES, Segment, View, Whole
@@ -105,7 +105,8 @@ class CoherentModel:
             levels, counts, cut = self.imager.levels(pose[0], number, time[0], again=again)
             if labels:
                 pings = next(self._expected.render(pose, time, [number], True))[0]
-                pings.levels, pings.expected, pings.cut = levels[None], pings.echoes, cut
+                left = net_loss(self.imager.sonar).astype(np.float32)[:, None]
+                pings.levels, pings.expected, pings.cut = levels[None], pings.echoes * left, cut
             else:
                 height_m = self.tracer.height_m(self.tracer.scene_at(time), self.tracer.inputs(pose, [number])[0])
                 pings = RenderedPings(number, levels[None], counts, np.array(height_m, dtype=float), cut=cut)
