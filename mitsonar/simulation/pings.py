@@ -162,7 +162,8 @@ def constant_gain(batches: Iterable[RenderedPings]) -> tuple[float, Iterator[Ren
         head.append(pings)
     levels = np.concatenate([pings.levels for pings in head])[:CALIBRATION_FRAMES]
     bright = float(np.percentile(levels, 99.9)) or float(levels.max())
-    return (0.9 / bright if bright > 0 else 1.0), chain(head, batches)
+    faintest = 0.9 / float(np.finfo(np.float32).max)  # below it, the gain exceeds single precision
+    return (0.9 / bright if bright > faintest else 1.0), chain(head, batches)
 
 
 def to_image(levels: NDArray[np.float32], gain: float, sonar: Sonar) -> NDArray[np.float32]:
