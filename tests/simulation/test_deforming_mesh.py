@@ -130,7 +130,8 @@ def test_a_deforming_mesh_keeps_its_reflectivities() -> None:
     new.update()
     mesh.add_attribute("face_reflectivity", 1, np.linspace(0.3, 0.9, mesh.face_count()).tolist())
     mesh.set_bsdf(mi.load_dict({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "face_reflectivity"}}))
-    loaded = separate(body=mesh)
+    shapes: Any = {"body": mesh}
+    loaded = separate(**shapes)
     rest = np.array(mesh.vertex_positions_buffer()).reshape(-1, 3)
     moving = {"body": Deforming(fixed(Pose(0, 0, 0)), lambda time_s: rest)}
     images = [Simulator(loaded, SONAR, moving=one).render([Pose(0, 0, 0)], gain=1.0).image for one in (moving, None)]

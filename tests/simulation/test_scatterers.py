@@ -65,7 +65,7 @@ def test_a_textured_mesh_without_uv_has_scatterers() -> None:
 
     mesh = mi.Mesh("body", 3, 1)
     values = mi.traverse(mesh)
-    values["vertex_positions"], values["faces"] = np.float32([0, 0, 0, 2, 0, 0, 0, 2, 0]), np.uint32([0, 1, 2])
+    values["vertex_positions"], values["faces"] = mi.Float([0, 0, 0, 2, 0, 0, 0, 2, 0]), mi.UInt32([0, 1, 2])
     values.update()
     mesh.set_bsdf(mi.load_dict(diffuse({**CELLS, "low": 0.3, "high": 0.3})))
     strength = scatterers_of(simulator(ChannelSonar(points_per_m2=1000.0), body=mesh)).strength
