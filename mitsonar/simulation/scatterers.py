@@ -918,7 +918,8 @@ def _is_covered_once(shape: mi.Shape) -> bool:
         return False
     number = dr.arange(mi.UInt32, UV_SAMPLES**2)
     uv = (mi.Point2f(mi.Float(number % UV_SAMPLES), mi.Float(number // UV_SAMPLES)) + 0.5) / UV_SAMPLES
-    si = shape.eval_parameterization(uv, mi.RayFlags.All, mi.Bool(True))
+    everywhere: DeviceArray = mi.Bool(True)
+    si = shape.eval_parameterization(uv, mi.RayFlags.All, everywhere)
     area = dr.select(si.is_valid(), dr.norm(dr.cross(si.dp_du, si.dp_dv)), 0)
     corners = triangles_of(shape)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
