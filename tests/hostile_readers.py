@@ -287,13 +287,13 @@ def read_run(folder: Path) -> None:
     gain, tally = progress_of(run, SONAR, ASKED["frames"])
     assert 0 <= tally.frames <= 30
     assert 0 < gain < np.inf
-    tally.warnings(Nearby(), np.zeros((30, 6)))
+    tally.warnings(Nearby(), np.zeros((30, 6)), np.zeros(30))
 
 
 class Nearby:
     """A source whose returns lie outside the window, in any frame."""
 
-    def window_range(self, pose: Any, ping: int) -> tuple[float, float]:
+    def window_range(self, pose: Any, ping: int, time_s: float) -> tuple[float, float]:
         return 0.1, 99.0
 
     def buried(self, pose: Any) -> str:

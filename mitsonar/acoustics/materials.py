@@ -144,7 +144,7 @@ def mu_at(table: MuTable, cosine: ArrayLike) -> NDArray[np.float64]:
 def single_mu(material: Material, frequency_hz: float | None = None, sound_speed_m_s: float = 1500.0) -> float:
     """Return a single reflectivity for all angles: mu of the law ``lambert``, else sigma / sin^2 at 45 deg grazing [1/sr].
 
-    It is used for impulse responses. A mirror part is not subtracted.
+    It is used for impulse responses. A mirror part is not subtracted: it is that of a fully rough surface.
 
     Args:
         material: the material.
@@ -154,7 +154,8 @@ def single_mu(material: Material, frequency_hz: float | None = None, sound_speed
     if material.law == "lambert" and material.mu is not None:
         return material.mu
     frequency = reference_hz(material) if frequency_hz is None else frequency_hz
-    return 2 * float(sigma_table(material, frequency, sound_speed_m_s)[45])
+    fully_rough = material.model_copy(update=dict.fromkeys(MIRROR))
+    return 2 * float(sigma_table(fully_rough, frequency, sound_speed_m_s)[45])
 
 
 def normal_mu(material: Material, frequency_hz: float, sound_speed_m_s: float = 1500.0) -> float:

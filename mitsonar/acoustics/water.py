@@ -34,6 +34,7 @@ __all__ = [
     "length",
     "loss_notes",
     "loss_of",
+    "net_loss",
     "noise_of",
     "sonar_absorption",
     "sound_speed_m_s",
@@ -321,6 +322,11 @@ def loss_of(sonar: Sonar) -> NDArray[np.float64]:
 def undone_absorption(sonar: Sonar) -> NDArray[np.float64]:
     """Return the intensity gain that compensates absorption ``(bins,)``; ones without ``gain_absorption``."""
     return 1 / loss_of(sonar) if sonar.gain_absorption else np.ones(sonar.range_bins)
+
+
+def net_loss(sonar: Sonar) -> NDArray[np.float64]:
+    """Return the fraction of the intensity that remains after absorption and its compensation by the gain ``(bins,)``."""
+    return np.asarray(loss_of(sonar) * undone_absorption(sonar), dtype=np.float64)
 
 
 def gain_of(sonar: Sonar) -> NDArray[np.float64]:

@@ -119,8 +119,10 @@ def path_for(
     distance_m = math.dist(ends[0][:3], ends[1][:3])
     if speed is not None and distance_m == 0:
         raise MitsonarError("--speed needs different places --from and --to: they are the same; leave --speed out")
-    rate_hz = 1 / frame_period_s(sonar) if speed is None else (poses - 1) * speed / distance_m
-    return Trajectory.between(*ends, poses, rate_hz)
+    if speed is None:
+        return Trajectory.between(*ends, poses, 1 / frame_period_s(sonar))
+    path = Trajectory.between(*ends, poses, (poses - 1) * speed / distance_m)
+    return first_sweeps(sonar, path, frames) if scans(sonar) else path
 
 
 def under_vehicle(path: Trajectory, sounder: Sounder, file: Path | None) -> Trajectory:

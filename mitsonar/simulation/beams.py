@@ -151,9 +151,9 @@ class BeamFormer:
         self.first_sine = -fan.sine - self.sine_step
         self.sines = math.ceil(2 * fan.sine / self.sine_step) + 4
         self.range_step = 1 / (RANGES_A_LOBE * self.pulse.lobes_per_m)
-        guard = PULSE_LENGTHS * self.pulse.resolution_m
-        self.first_range = max(sonar.range_min - guard, self.range_step)
-        self.ranges = math.ceil((sonar.range_max + guard - self.first_range) / self.range_step) + 3
+        self._guard = PULSE_LENGTHS * self.pulse.resolution_m
+        self.first_range = max(sonar.range_min - self._guard, self.range_step)
+        self.ranges = math.ceil((sonar.range_max + self._guard - self.first_range) / self.range_step) + 3
 
     @cached_property
     def over_range(self) -> Banded:
@@ -162,26 +162,32 @@ class BeamFormer:
         spectrum = _divided(pulse.spectrum(), kernel_spectrum(pulse.spectrum().frequency * self.range_step))
         amplitude = _interpolated(spectrum, (PULSE_LENGTHS + 1) * pulse.resolution_m)
         gain = math.sqrt(self.sonar.bin_m / pulse.equivalent_m)
-        return self._banded(lambda away: amplitude(away).real * gain, self.ranges, self.range_step)
+        return self._banded(lambda away: amplitude(away).real * gain, self.first_range, self.ranges, self.range_step)
 
     @cached_property
     def over_noise(self) -> Banded:
         """Return the pulse as a matrix ``(bins, draws)`` with rows of unit power, which filters white noise over range."""
         step = 1 / (DRAWS_A_LOBE * self.pulse.lobes_per_m)
-        draws = math.ceil((self.sonar.range_max - self.first_range + PULSE_LENGTHS * self.pulse.resolution_m) / step) + 1
+        first = self.sonar.range_min - self._guard  # also before the ping, where there are no echoes
+        draws = math.ceil((self.sonar.range_max - first + self._guard) / step) + 1
         power = np.square(self.pulse.shape(np.arange(-40, 41) * step)).sum()
-        return self._banded(lambda away: self.pulse.shape(away) / math.sqrt(power), draws, step)
+        return self._banded(lambda away: self.pulse.shape(away) / math.sqrt(power), first, draws, step)
 
-    def _banded(self, amplitude: Callable[[NDArray[np.float64]], NDArray[np.float64]], lines: int, step: float) -> Banded:
-        """Return a function of the distance between bin and line [m] as a matrix ``(bins, lines)``."""
+    def _banded(
+        self, amplitude: Callable[[NDArray[np.float64]], NDArray[np.float64]], begin_m: float, lines: int, step: float
+    ) -> Banded:
+        """Return a function of the distance between bin and line [m] as a matrix ``(bins, lines)``.
+
+        Lines are ``step`` apart, from ``begin_m`` on [m].
+        """
         places = self.sonar.range_m
         reach = PULSE_LENGTHS * self.pulse.resolution_m
         blocks = []
         for begin in range(0, len(places), BLOCK):  # block by block, because the whole matrix grows with the square of bins
             rows = places[begin : begin + BLOCK]
-            first = max(0, math.ceil((rows[0] - reach - self.first_range) / step))
-            last = min(lines, math.floor((rows[-1] + reach - self.first_range) / step) + 1)
-            away = rows[:, None] - (self.first_range + np.arange(first, last) * step)
+            first = max(0, math.ceil((rows[0] - reach - begin_m) / step))
+            last = min(lines, math.floor((rows[-1] + reach - begin_m) / step) + 1)
+            away = rows[:, None] - (begin_m + np.arange(first, last) * step)
             block = np.where(np.abs(away) <= reach, amplitude(away), 0)
             blocks.append((first, block.astype(np.float32)))
         return Banded(len(places), blocks, lines)

@@ -139,7 +139,8 @@ def jittered(simulator: Simulator) -> Simulator:
     if simulator.sonar.jittered:
         return simulator
     sonar = simulator.sonar.replace(jitter=True)
-    return Simulator(simulator.tracer.scene, sonar, views=simulator.views, mirrors=simulator.mirrors)
+    moving = None if simulator.motion is None else simulator.motion.bodies
+    return Simulator(simulator.tracer.scene, sonar, views=simulator.views, mirrors=simulator.mirrors, moving=moving)
 
 
 def step_for(sonar: Sonar, part: float = STEP) -> Motion:

@@ -314,19 +314,26 @@ class DeformingMesh:
         self.version, self._time_s = self.version + 1, time_s
 
 
+OF_ANY_MESH = ("vertex_positions", "vertex_normals", "vertex_texcoords")
+"""Names of parameters that are no attributes of a mesh."""
+
+
 def _copied(mesh: mi.Mesh) -> mi.Mesh:
-    """Return a mesh with the same triangles, uv and object numbers, without vertex normals."""
+    """Return a mesh with the same triangles, uv and attributes, without vertex normals."""
     props = mi.Properties()
     props["bsdf"] = mesh.bsdf()
     uv = mesh.has_vertex_texcoords()
     copied = mi.Mesh(mesh.id(), mesh.vertex_count(), mesh.face_count(), props, False, uv)
-    old, new = mi.traverse(mesh), mi.traverse(copied)
+    old: Any = mi.traverse(mesh)  # the type stubs lack keys()
+    new = mi.traverse(copied)
     for name in ("vertex_positions", "faces", *(("vertex_texcoords",) if uv else ())):
         new[name] = type(new[name])(old[name])
     new.update()
-    if mesh.has_attribute("face_id")[0]:
-        numbers = mesh.attribute_buffer("face_id")
-        copied.add_attribute("face_id", dr.width(numbers) // mesh.face_count(), np.array(numbers).tolist())
+    for name in old.keys():  # noqa: SIM118  no dict
+        if name.startswith(("face_", "vertex_")) and name not in OF_ANY_MESH:  # reflectivities, numbers of objects ...
+            values = np.array(mesh.attribute_buffer(name))
+            count = mesh.face_count() if name.startswith("face_") else mesh.vertex_count()
+            copied.add_attribute(name, len(values) // count, values.tolist())
     copied.set_id(mesh.id())
     return copied
 

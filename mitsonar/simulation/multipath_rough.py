@@ -26,6 +26,7 @@ from mitsonar.simulation.coherent_tracing import ADD, CoherentTracer, FanRays
 from mitsonar.simulation.device import DeviceArray, Frozen, replayed
 from mitsonar.simulation.mirrors import SecondMirrors, parts_at, smooth_share, without_mirror_part
 from mitsonar.simulation.moving import scene_at
+from mitsonar.simulation.points import seed_bits
 from mitsonar.simulation.tracing import going_on, half_path_rate, hidden, lambert_direction, overlap, reflected
 
 __all__ = ["Arrival", "DiffuseField", "Vertex", "Walk", "at_most_one"]
@@ -356,7 +357,7 @@ class DiffuseField:
             # 3. energy of each arrival, from the solid angle of its ray's cell
             cell = dr.norm(dr.cross(rays.by_sine, rays.by_tangent)) * (rays.sine_step * rays.tangent_step)
             sums = dr.zeros(mi.UInt64, self.shape[0] * self.shape[1])
-            for arrival in walk.arrivals(begin, index, mi.UInt32(self.sonar.seed * 7919 & 0xFFFFFFFF)):
+            for arrival in walk.arrivals(begin, index, mi.UInt32(seed_bits(self.sonar.seed))):
                 if not arrival.same:
                     self._deposit(rays, arrival, cell, sums)
             dr.eval(sums)

@@ -162,7 +162,8 @@ def constant_gain(batches: Iterable[RenderedPings]) -> tuple[float, Iterator[Ren
         head.append(pings)
     levels = np.concatenate([pings.levels for pings in head])[:CALIBRATION_FRAMES]
     bright = float(np.percentile(levels, 99.9)) or float(levels.max())
-    return (0.9 / bright if bright > 0 else 1.0), chain(head, batches)
+    faintest = 0.9 / float(np.finfo(np.float32).max)  # below it, the gain exceeds single precision
+    return (0.9 / bright if bright > faintest else 1.0), chain(head, batches)
 
 
 def to_image(levels: NDArray[np.float32], gain: float, sonar: Sonar) -> NDArray[np.float32]:
@@ -300,18 +301,24 @@ class Tally:
         if outside.max() > self.worst[0]:
             self.worst = int(outside.max()), pings.first + int(outside.argmax())
 
-    def warnings(self, source: Any, poses: NDArray[np.float64]) -> list[str]:
+    def warnings(self, source: Any, poses: NDArray[np.float64], time_s: NDArray[np.float64]) -> list[str]:
         """Return the warnings of the run; ``source`` is the simulator, which traces the worst frame again for its ranges."""
-        return list(self.findings(source, poses).values())
+        return list(self.findings(source, poses, time_s).values())
 
     def findings(
-        self, source: Any, poses: NDArray[np.float64], first: int = 0, issued: Container[str] = ()
+        self,
+        source: Any,
+        poses: NDArray[np.float64],
+        time_s: NDArray[np.float64],
+        first: int = 0,
+        issued: Container[str] = (),
     ) -> dict[str, str]:
         """Return the sentences of :meth:`warnings`, keyed by the name of their subject.
 
         Args:
             source: the simulator, which traces the worst frame again for its ranges.
             poses: poses of the frames ``(frames, 6)`` [m, rad].
+            time_s: times of the frames ``(frames,)``, at which moving bodies are placed [s].
             first: number of the first of these frames.
             issued: names of warnings that have been issued already; frames are not traced again for these.
         """
@@ -323,13 +330,13 @@ class Tally:
             number, *its_rays = self.first_empty
             pose = poses[number - first]
             window = (sonar.range_min, sonar.range_max)
-            returns = source.window_range(pose, number)
+            returns = source.window_range(pose, number, float(time_s[number - first]))
             sentences["empty"] = empty_frames(
                 self.empty, self.frames, (number, pose), its_rays, window, returns, source.buried(pose)
             )
         if outside > NEGLIGIBLE * hits and "window" not in issued:
             frame = self.worst[1]
-            ends = source.window_range(poses[frame - first], frame)
+            ends = source.window_range(poses[frame - first], frame, float(time_s[frame - first]))
             where = f", in frame {frame} at {ends[0]:.2f}..{ends[1]:.2f} m" if ends else ""
             sentences["window"] = (
                 f"{outside:,} of {hits:,} returns ({percent(outside / hits)} %) lie outside the window "

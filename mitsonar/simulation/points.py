@@ -35,6 +35,7 @@ __all__ = [
     "patch_weight",
     "pick",
     "place_in_cell",
+    "seed_bits",
     "weight_of",
 ]
 
@@ -176,7 +177,12 @@ def lattice_key(grain: DeviceArray, axis: DeviceArray, side: DeviceArray, seed: 
         side: 1 where the normal points along that axis, 0 where it points against it.
         seed: seed of the hash.
     """
-    return _mixed(grain * 8 + axis * 2 + side + mi.UInt32(seed * 7919 & 0xFFFFFFFF))
+    return _mixed(grain * 8 + axis * 2 + side + mi.UInt32(seed_bits(seed)))
+
+
+def seed_bits(seed: int) -> int:
+    """Return 32 bits that depend on all bits of a seed."""
+    return (seed * 7919 + (seed >> 32) * 0x9E3779B1) & 0xFFFFFFFF
 
 
 def place_in_cell(

@@ -154,7 +154,7 @@ class Source(Protocol):
     def bodies(self, time_s: ArrayLike) -> BodyStates:
         """Return the names of the moving bodies, with their poses and velocities at the given times."""
 
-    def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
+    def window_range(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> tuple[float, float] | None:
         """Return the ranges of the nearest and the farthest return outside the window [m]."""
 
     def buried(self, pose: ArrayLike) -> str:
@@ -288,7 +288,7 @@ def _write_frames(source: Source, timed: TimedPath, options: RenderOptions, run:
             yield len(pings), {"frames_done": tally.frames, **label_names, "gain": gain, "tally": tally.state()}
     # 4. warnings, and one file of a short run
     notes = [*source.notes, *overlap_notes(sonar, trajectory.time_s)]
-    yield 0, {"warnings": [*notes, *tally.warnings(source, trajectory.poses)]}
+    yield 0, {"warnings": [*notes, *tally.warnings(source, trajectory.poses, trajectory.time_s)]}
     assert store is not None
     if len(trajectory) <= MAX_NPZ_FRAMES:
         store.pack(folder / "frames.npz")
@@ -372,7 +372,7 @@ class StoredEchoes:
         """Read the echoes of one frame from its EXR file."""
         return load_exr(self.folder / "echoes" / f"{ping:06d}.exr", self.traced)
 
-    def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
+    def window_range(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> tuple[float, float] | None:
         """Return the ranges of the nearest and the farthest return outside the window [m]."""
         return self.film_echoes(pose, ping).outside(self.sonar)
 

@@ -37,6 +37,7 @@ from mitsonar.simulation.mirrors import (
 )
 from mitsonar.simulation.moving import MovingScene, SceneMotion
 from mitsonar.simulation.points import Patches, SurfacePoints, lattice_points, lattice_size
+from mitsonar.simulation.shape_pieces import triangles_of
 from mitsonar.simulation.tracing import height_below, hidden
 
 __all__ = [
@@ -793,7 +794,7 @@ class Scatterers:
                     raise MitsonarError(
                         f"scatterers cannot lie on instances: got {shape.id()}; give the scene meshes instead"
                     )
-                grid = _grid_of(shape) if sonar.scatterer_spacing_m is None else None
+                grid = _grid_of(shape) if sonar.scatterer_spacing_m is None and _is_covered_once(shape) else None
                 some = _in_cells(shape, grid, number) if grid else _on_lattice(shape, sonar, number, within)
                 if within is not None:
                     inside = ((some.place >= within[0]) & (some.place <= within[1])).all(axis=1)
@@ -900,6 +901,29 @@ def _grid_of(shape: mi.Shape) -> _Grid | None:
         size = texture.resolution()
         return _Grid(None, int(size[0]), int(size[1]))
     return None
+
+
+UV_SAMPLES, COVERED = 512, 0.95
+"""Points of uv along each axis that are tested, and the share of a mesh that they must cover."""
+
+
+def _is_covered_once(shape: mi.Shape) -> bool:
+    """Return whether each place of a shape has its uv in the unit square, and shares it with no other place.
+
+    The uv of a mesh may repeat, or be the same on several facets, as on those of a cube: a cell then has several places.
+    """
+    if not isinstance(shape, mi.Mesh):
+        return True
+    if not shape.has_vertex_texcoords():
+        return False
+    number = dr.arange(mi.UInt32, UV_SAMPLES**2)
+    uv = (mi.Point2f(mi.Float(number % UV_SAMPLES), mi.Float(number // UV_SAMPLES)) + 0.5) / UV_SAMPLES
+    everywhere: DeviceArray = mi.Bool(True)
+    si = shape.eval_parameterization(uv, mi.RayFlags.All, everywhere)
+    area = dr.select(si.is_valid(), dr.norm(dr.cross(si.dp_du, si.dp_dv)), 0)
+    corners = triangles_of(shape)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return float(np.array(area).mean()) > COVERED * float(np.linalg.norm(normal, axis=1).sum()) / 2
 
 
 class _Zeta(NamedTuple):

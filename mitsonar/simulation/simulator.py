@@ -181,9 +181,9 @@ class Simulator:
         same = self.tracer.sonar is self.sonar
         return self.tracer if same else tracer_of(self.tracer.scene, self.sonar, self.motion)
 
-    def window_range(self, pose: ArrayLike, ping: int) -> tuple[float, float] | None:
+    def window_range(self, pose: ArrayLike, ping: int, time_s: float | None = None) -> tuple[float, float] | None:
         """Return the nearest and farthest return outside the window of one ping [m]; None if all lie inside."""
-        return self.film_echoes(pose, ping).outside(self.sonar)
+        return self.film_echoes(pose, ping, time_s).outside(self.sonar)
 
     def buried(self, pose: ArrayLike) -> str:
         """Describe how a pose lies below the ground or inside an object; empty if it does not, or if bodies move."""
@@ -238,7 +238,7 @@ class Simulator:
             truth.append(labels_above(pings, gain, label_floor))
         labelled: dict[str, Any] = {name: np.concatenate([part[name] for part in truth]) for name in truth[0]}
         notes = [*self.notes, *overlap_notes(self.sonar, timed.frames.time_s)]
-        for sentence in [*notes, *tally.warnings(self, timed.frames.poses)]:
+        for sentence in [*notes, *tally.warnings(self, timed.frames.poses, timed.frames.time_s)]:
             warnings.warn(sentence, MitsonarWarning, stacklevel=2)
         return self._frames(np.concatenate(images), timed, np.concatenate(heights), gain, labelled)
 
@@ -330,7 +330,7 @@ class Simulator:
         applied_gain = 1.0 if self.gain is None else self.gain
         self._stepped = number + 1
         image = to_image(pings.levels, applied_gain, self.sonar)
-        self._warn_once(pings, image, table)
+        self._warn_once(pings, image, table, moment_s)
         noisy = image if noise is None else noise.apply(image, seed=seed, frames=np.array([number]))
         labelled = labels_above(pings, applied_gain, label_floor)
         timed = TimedPath(Trajectory(table, np.array([moment_s])), *moments_of(self.sonar, table, [moment_s], number)[1::-1])
@@ -342,11 +342,13 @@ class Simulator:
         self._gain_from, self.gain = "", None
         self._issued.clear()
 
-    def _warn_once(self, pings: RenderedPings, image: NDArray[np.float32], pose: NDArray[np.float64]) -> None:
+    def _warn_once(self, pings: RenderedPings, image: NDArray[np.float32], pose: NDArray[np.float64], time_s: float) -> None:
         """Issue the warnings of one step, each kind once in a loop."""
         tally = Tally(self.sonar, self._gain_from)
         tally.add(pings, image)
-        sentences = {note: note for note in self.notes} | tally.findings(self, pose, pings.first, self._issued)
+        sentences = {note: note for note in self.notes} | tally.findings(
+            self, pose, np.array([time_s]), pings.first, self._issued
+        )
         for kind in [kind for kind in sentences if kind not in self._issued]:
             self._issued.add(kind)
             warnings.warn(sentences[kind], MitsonarWarning, stacklevel=3)

@@ -452,6 +452,14 @@ def test_one_number_for_all_angles() -> None:
     assert single_mu(material("sand"), 5e4) == pytest.approx(2 * sigma_table(material("sand"), 5e4)[45])
 
 
+def test_one_number_does_not_depend_on_the_mirror_part() -> None:
+    """At 100 kHz, 10 um of roughness leave 2e-5 of the power to scattering, which impulse responses multiply by."""
+    mirror = {"reflection": 0.9, "roughness_m": 1e-5}
+    for law, share in (("lambert", 1.0), ("lommel-seeliger", np.sqrt(2))):
+        plain, smooth = (Material.create(law=law, mu=0.05, **more) for more in ({}, mirror))
+        assert single_mu(smooth, 1e5) == single_mu(plain, 1e5) == pytest.approx(0.05 * share)
+
+
 def test_the_frequency_where_none_is_given() -> None:
     assert reference_hz(material("sand")) == pytest.approx(np.sqrt(10e3 * 100e3))
     assert reference_hz(Material(mu=0.1)) == 100e3

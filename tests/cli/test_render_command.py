@@ -453,6 +453,21 @@ def test_all_sensors_of_a_scene_in_one_run(mitsonar: Command, tmp_path: Path) ->
 # ---------------------------------------------------------------- how fast, and how often
 
 
+@pytest.mark.parametrize("speed", [0.01, 0.0125])
+def test_frames_of_a_head_are_its_sweeps_at_any_speed(speed: float) -> None:
+    """A metre takes 100 or 80 s, and a sweep of a ping360 19 s: three of them end on the way."""
+    from mitsonar.cli.options import path_for
+    from mitsonar.instruments.sonar import timed_path
+    from mitsonar.instruments.sounder import preset
+
+    head, ends = preset("ping360"), ("0,0,2,10,0,0", "1,0,2,10,0,0")
+    path = path_for(head, None, "flat_floor", 3, *ends, None, "mitsonar", speed)
+    assert len(timed_path(head, path).frames) == 3
+    assert path.poses[-1, 0] == pytest.approx(speed * path.time_s[-1])
+    with pytest.raises(MitsonarError, match="room for 2: got 3"):
+        path_for(head, None, "flat_floor", 3, *ends, None, "mitsonar", 0.025)
+
+
 def test_speed_and_sweeps_are_as_asked_and_haste_is_told(mitsonar: Command, tmp_path: Path) -> None:
     out, draft = tmp_path / "o", ("--model", "physical", "--quality", "draft", "--set", "beams=8", "--overwrite")
     way = ("--from", "0,0,2,30,0,0", "--to", "0,3,2,30,0,0", "--frames", 4)

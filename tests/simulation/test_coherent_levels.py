@@ -13,6 +13,7 @@ from scipy import special
 from scipy.ndimage import uniform_filter
 
 from mitsonar.acoustics.water import gain_of, sonar_absorption
+from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import named_sonars, preset
 from mitsonar.simulation.simulator import Simulator
@@ -118,3 +119,11 @@ def test_detrended_correlation_by_level(flat: mi.Scene, above_db: float) -> None
     agreement = (1 + 10 ** (-above_db / 10)) ** -2
     assert intensity == pytest.approx(agreement, abs=0.03)
     assert decibels == pytest.approx(special.spence(1 - agreement) / (math.pi**2 / 6), abs=0.03)
+
+
+def test_a_gain_beyond_single_precision_is_refused(flat: mi.Scene) -> None:
+    """2.84 dB/m at 3 MHz, 100 m there and back: from 68 m on, noise times gain would be infinite."""
+    sonar = SONAR.replace(frequency_hz=3e6, absorption_db_per_m=None, gain_absorption=True, range_max=100.0)
+    with pytest.raises(MitsonarError, match=r"568\.8 dB there and back to range_max 100 m"):
+        Simulator(flat, sonar)
+    Simulator(flat, sonar.replace(range_max=20.0))

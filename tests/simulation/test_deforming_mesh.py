@@ -117,3 +117,23 @@ def test_mistakes_are_told(balls: list[Path], tmp_path: Path) -> None:
     trimesh.creation.icosphere(subdivisions=2).export(tmp_path / "other.ply")
     with pytest.raises(MitsonarError, match="other triangles"):
         load_meshes([balls[0], tmp_path / "other.ply"], 1.0)
+
+
+def test_a_deforming_mesh_keeps_its_reflectivities() -> None:
+    """Those of facets are attributes, as in all generated worlds; at rest the body is the one of the scene."""
+    import mitsuba as mi
+
+    cube = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 4, 0])})
+    mesh = mi.Mesh("body", cube.vertex_count(), cube.face_count())
+    old, new = mi.traverse(cube), mi.traverse(mesh)
+    new["vertex_positions"], new["faces"] = old["vertex_positions"], old["faces"]
+    new.update()
+    mesh.add_attribute("face_reflectivity", 1, np.linspace(0.3, 0.9, mesh.face_count()).tolist())
+    mesh.set_bsdf(mi.load_dict({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "face_reflectivity"}}))
+    shapes: Any = {"body": mesh}
+    loaded = separate(**shapes)
+    rest = np.array(mesh.vertex_positions_buffer()).reshape(-1, 3)
+    moving = {"body": Deforming(fixed(Pose(0, 0, 0)), lambda time_s: rest)}
+    images = [Simulator(loaded, SONAR, moving=one).render([Pose(0, 0, 0)], gain=1.0).image for one in (moving, None)]
+    assert images[1].any()
+    np.testing.assert_allclose(images[0], images[1], atol=1e-5 * images[1].max())

@@ -121,3 +121,13 @@ def test_labels_lie_where_the_boxes_are(flat: mi.Scene) -> None:
 def test_absorption_without_a_pattern_is_refused(flat: mi.Scene) -> None:
     with pytest.raises(MitsonarError, match="give pattern two_way"):
         Simulator(flat, Sonar(absorption_db_per_m=0.3))
+
+
+def test_bins_before_the_window_begin_at_the_sonar_at_least() -> None:
+    """75 bins of 1.6 / 300 m are 0.4 m and, by rounding, 6e-17 m more."""
+    from mitsonar.simulation.models.physical import ExpectedFormer
+
+    sonar = DIDSON.replace(range_min=0.4, range_max=2.0, range_bins=300, pulse_m=0.2, quality="draft", beams=4)
+    former = ExpectedFormer(sonar)
+    assert former.extra_bins[0] == 75
+    assert former.traced.range_min == 0

@@ -83,3 +83,27 @@ def test_shadow_behind_a_box(tall: float, half: float) -> None:
         assert (code[shadow, middle] == 2).all()
     # past the lit floor nothing travels on, unless the upper rays pass over the floor's end
     assert (code[beyond, side] == (2 if half > 50 else 1)).all()
+
+
+def test_a_floor_below_all_echoes_leaves_the_shadows_of_ping_groups_with_a_pattern() -> None:
+    """Only the beams on the box send no sound on; counts of each beam, not of the frame, decide between 1 and 2."""
+    loaded = scene(floor=floor(diffuse(0.4), 6.0), box=box((0, 4.2, 0.8), (0.4, 0.1, 0.8), diffuse(0.8)))
+    sonar = LABELLED.replace(pattern="two_way", elevation_pattern="box", frequency_hz=7e5, ping_groups=3, rays_per_beam=200)
+    plain, above = (Simulator(loaded, sonar).render([POSE], labels=True, label_floor=low) for low in (0.0, 1e-20))
+    assert plain.shadow is not None
+    assert set(np.unique(plain.shadow)) == {0, 1, 2}
+    np.testing.assert_array_equal(above.shadow, plain.shadow)
+
+
+@pytest.mark.parametrize("undone", [False, True])
+@pytest.mark.parametrize("model", ["physical", "coherent"])
+def test_labels_are_of_what_absorption_leaves(model: str, undone: bool) -> None:
+    """Expected levels, to which a label floor is compared, fall by 2 dB/m there and back unless the gain undoes it."""
+    clear = LABELLED.replace(
+        model=model, pattern="two_way", frequency_hz=7e5, absorption_db_per_m=0.0, rays_per_beam=200, range_bins=64
+    )
+    dim = clear.replace(absorption_db_per_m=2.0, gain_absorption=undone)
+    loaded = scene(floor=floor(diffuse(0.4)))
+    pings, lossless = (next(Simulator(loaded, sonar).pings(POSE, labels=True)) for sonar in (dim, clear))
+    left = np.ones(64) if undone else 10 ** (-0.4 * dim.range_m)
+    np.testing.assert_allclose(pings.echoes[0], lossless.echoes[0] * left[:, None], rtol=1e-5)

@@ -18,7 +18,7 @@ from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
-from mitsonar.simulation.pings import Tally
+from mitsonar.simulation.pings import Counts, RenderedPings, Tally, constant_gain, to_image
 from mitsonar.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -249,7 +249,7 @@ def test_warned_of_returns_outside_the_window(flat: mi.Scene) -> None:
 class _Seen:
     """A source whose worst frame lost returns at 6..7 m."""
 
-    def window_range(self, pose: object, number: int) -> tuple[float, float]:
+    def window_range(self, pose: object, number: int, time_s: float) -> tuple[float, float]:
         return 6.0, 7.0
 
 
@@ -258,7 +258,7 @@ def test_a_negligible_share_outside_the_window_is_not_warned_of(outside: int, wa
     """Up to a thousandth of the returns."""
     rays = {"inside": 21_299_182 - outside, "nearer": 0, "farther": outside, "missed": 0}
     tally = Tally(SMALL, frames=1, rays=rays, pixels=100, filled=100, worst=(outside, 0))
-    assert ("window" in tally.findings(_Seen(), np.zeros((1, 6)))) == warned
+    assert ("window" in tally.findings(_Seen(), np.zeros((1, 6)), np.zeros(1))) == warned
 
 
 def test_warned_of_saturation(flat: mi.Scene) -> None:
@@ -428,3 +428,13 @@ def test_profile_of_a_body_that_curves(across: int, allowed_db: float) -> None:
     truth = 0.5 * cosine**2 * 2 * np.pi * radius * r / away * sonar.bin_m / r**4
     assert np.percentile(np.abs(10 * np.log10(got / truth)), 95) < allowed_db
     assert 10 * np.log10(got.sum() / truth.sum()) == pytest.approx(0, abs=0.05)
+
+
+def test_levels_too_faint_for_a_gain_in_single_precision_stay_finite() -> None:
+    """400 dB of absorption leave 1e-43; 0.9 over that is beyond 3e38, and 0 times infinity is not a number."""
+    levels = np.zeros((1, 8, 4), np.float32)
+    levels[0, 3] = 1e-43
+    counts = Counts(*np.zeros((4, 1, 4), dtype=np.int64))
+    gain, batches = constant_gain([RenderedPings(0, levels, counts, np.zeros(1))])
+    assert gain == 1.0
+    assert np.isfinite(to_image(next(batches).levels, gain, SMALL)).all()

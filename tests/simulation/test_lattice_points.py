@@ -84,6 +84,13 @@ def test_points_follow_from_seed_and_shape() -> None:
         assert len(set(second.phase) & set(one.phase)) < 10  # of numbers of 24 bits, a few are equal by chance
 
 
+@pytest.mark.parametrize("seed", [2**32, 5 * 2**40])
+def test_points_follow_from_all_bits_of_a_seed(seed: int) -> None:
+    body = plate((0, 0, 0), (0, 0, 1), 0.5)
+    one, second = found(body), found(body, seed=seed)
+    assert len(set(second.phase) & set(one.phase)) < 10
+
+
 def test_the_back_of_a_body_behind_its_front_is_found() -> None:
     """Rays go on behind what they hit. Mitsuba makes one shape of both sheets."""
     (both,) = scene(low=plate((0, 0, 0), (0, 0, 1), 1.0), high=plate((0, 0, 0.3), (0, 0, 1), 1.0)).shapes()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import box, diffuse, floor, plate, separate, sphere
 
-from mitsonar.errors import MitsonarError
+from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.pose import Pose, vehicle_rotation
 from mitsonar.motion.trajectory import Trajectory
@@ -120,6 +120,22 @@ def test_steps_are_the_frames_of_a_run() -> None:
         simulator.step(pose, time_s=time, gain=2.0).image[0] for pose, time in zip(path.poses, path.time_s, strict=True)
     ]
     np.testing.assert_array_equal(run.image, steps)
+
+
+def test_derivatives_of_a_sonar_without_jitter_see_the_bodies_where_they_were_placed() -> None:
+    from mitsonar.simulation.derivatives import jittered
+
+    loaded = separate(wall=plate((0, 0, 0), (0, -1, 0)))
+    simulator = Simulator(loaded, SONAR.replace(jitter=False), moving={"wall": along(6)})
+    nearest = jittered(simulator).film_echoes(Pose(0, 0, 0), 0).range_m.min()
+    assert nearest == pytest.approx(6.0, abs=0.01)
+
+
+def test_returns_outside_the_window_are_named_where_the_body_was() -> None:
+    """A wall that moves off at 1 m/s is 20 m away at the frame's time, 15 s, and within the window at 0 s."""
+    simulator = Simulator(separate(wall=plate((0, 0, 0), (0, -1, 0))), SONAR, moving={"wall": along(5, 25, rate_hz=0.05)})
+    with pytest.warns(MitsonarWarning, match=r"lie outside the window 2\.\.9 m, in frame 0 at 20\.\d\d\.\."):
+        simulator.render(Trajectory(np.zeros((1, 6)), np.array([15.0])))
 
 
 @pytest.mark.parametrize(

@@ -246,3 +246,11 @@ def test_white_noise_has_unit_power_everywhere() -> None:
     rows = over_range @ np.eye(over_range.columns, dtype=np.float32)
     np.testing.assert_allclose(np.square(rows).sum(axis=1), 1, atol=2e-3)
     np.testing.assert_allclose(rows @ rows.T, source.bin_correlation().toarray(), atol=2e-3)
+
+
+@pytest.mark.parametrize("pulse_m", [None, 0.2])
+def test_white_noise_has_unit_power_from_the_first_bin_of_a_window_that_begins_at_the_sonar(pulse_m: float | None) -> None:
+    sonar = SONAR.replace(range_min=0.0, range_max=2.0, range_bins=100, pulse_m=pulse_m)
+    over_range = BeamFormer(sonar).over_noise
+    rows = over_range @ np.eye(over_range.columns, dtype=np.float32)
+    np.testing.assert_allclose(np.square(rows).sum(axis=1), 1, atol=2e-3)

@@ -53,6 +53,25 @@ def test_a_textured_floor_has_the_strength_of_its_cells() -> None:
     assert scatterers_of(result).strength.sum() == pytest.approx(0.5 * 28**2, rel=0.01)
 
 
+def test_a_textured_cube_has_the_strength_of_all_faces() -> None:
+    """Its six faces share one square of uv, of which each place had a scatterer on one of them."""
+    body = box((0, 0, 0), (1, 2, 3), diffuse({**CELLS, "cells": 40.0}))
+    strength = scatterers_of(simulator(ChannelSonar(points_per_m2=200.0), body=body)).strength
+    assert strength.sum(dtype=float) == pytest.approx(0.5 * 88, rel=5 / np.sqrt(len(strength)))
+
+
+def test_a_textured_mesh_without_uv_has_scatterers() -> None:
+    import mitsuba as mi
+
+    mesh = mi.Mesh("body", 3, 1)
+    values = mi.traverse(mesh)
+    values["vertex_positions"], values["faces"] = mi.Float([0, 0, 0, 2, 0, 0, 0, 2, 0]), mi.UInt32([0, 1, 2])
+    values.update()
+    mesh.set_bsdf(mi.load_dict(diffuse({**CELLS, "low": 0.3, "high": 0.3})))
+    strength = scatterers_of(simulator(ChannelSonar(points_per_m2=1000.0), body=mesh)).strength
+    assert strength.sum(dtype=float) == pytest.approx(0.3 * 2, rel=4 / np.sqrt(len(strength)))
+
+
 def test_a_field_of_view_selects_all_that_it_receives() -> None:
     field = FieldOfView(heading_deg=40.0, tilt_deg=35.0, across_deg=17.0, along_deg=60.0)
     for one in (

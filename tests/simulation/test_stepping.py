@@ -158,7 +158,7 @@ def test_a_loop_warns_once_of_each_thing(ground: mi.Scene) -> None:
 def test_ranges_outside_are_sought_for_the_warning_only(ground: mi.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another tracing, for a sentence that is given once, would cost every ping of a loop seconds in a large scene."""
     near, sought = Simulator(ground, SONAR.replace(range_max=4.4)), []
-    monkeypatch.setattr(near, "window_range", lambda pose, ping: sought.append(ping))
+    monkeypatch.setattr(near, "window_range", lambda pose, ping, time_s: sought.append(ping))
     with pytest.warns(MitsonarWarning, match="lie outside the window"):
         stepped(near, POSES)
     assert sought == [0]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.water import gain_of, loss_notes, loss_of
+from mitsonar.acoustics.water import gain_of, loss_notes, loss_of, net_loss, sonar_absorption
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.sonar import Quality, Sonar
 from mitsonar.instruments.views import CONES, Segment, View, Whole
@@ -105,7 +105,8 @@ class CoherentModel:
             levels, counts, cut = self.imager.levels(pose[0], number, time[0], again=again)
             if labels:
                 pings = next(self._expected.render(pose, time, [number], True))[0]
-                pings.levels, pings.expected, pings.cut = levels[None], pings.echoes, cut
+                left = net_loss(self.imager.sonar).astype(np.float32)[:, None]
+                pings.levels, pings.expected, pings.cut = levels[None], pings.echoes * left, cut
             else:
                 height_m = self.tracer.height_m(self.tracer.scene_at(time), self.tracer.inputs(pose, [number])[0])
                 pings = RenderedPings(number, levels[None], counts, np.array(height_m, dtype=float), cut=cut)
@@ -130,7 +131,7 @@ class CoherentImager:
         notes: warnings about scene and sonar.
 
     Raises:
-        MitsonarError: a view is a receiver elsewhere or a cone; there are mirrors in portions.
+        MitsonarError: a view is a receiver elsewhere or a cone; there are mirrors in portions; the gain is too large.
     """
 
     def __init__(
@@ -142,6 +143,7 @@ class CoherentImager:
         motion: SceneMotion | None = None,
         groups: NDArray[np.int64] | None = None,
     ) -> None:
+        check_gain(sonar)
         self.views = check_views(views or [Whole(sonar)], mirrors)
         self.sides = tuple(dict.fromkeys(side_of(view) for view in self.views))
         self.sonar, self.sampled = sonar, sampled(sonar)
@@ -282,6 +284,22 @@ def point_notes(sonar: Sonar) -> list[str]:
         f"a resolution cell holds {points:.2g} points at {nearest:g} m, {FEWEST_A_CELL:g} from {enough:.3g} m on: below, "
         f"intensities vary more than speckle does; a scatterer_spacing_m of {needed:.2g} m is enough everywhere"
     ]
+
+
+def check_gain(sonar: Sonar) -> None:
+    """Check that levels after the time-varying gain fit single precision.
+
+    Raises:
+        MitsonarError: the gain is too large.
+    """
+    with np.errstate(divide="ignore"):
+        largest = gain_of(sonar).max()
+    if largest > np.finfo(np.float32).max:
+        undone_db = 2 * sonar_absorption(sonar) * sonar.range_max
+        raise MitsonarError(
+            f"gain_absorption undoes {undone_db:.4g} dB there and back to range_max {sonar.range_max:g} m, more than levels "
+            "can hold, 385 dB with the gain of spreading: lower range_max, or leave gain_absorption out"
+        )
 
 
 def check_views(views: Sequence[View], mirrors: Mirroring) -> Sequence[View]:

@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from mitsonar.acoustics.water import loss_of, sonar_absorption, undone_absorption
+from mitsonar.acoustics.water import net_loss, sonar_absorption
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.beams import Pulse
 from mitsonar.instruments.sonar import RAYS, Sonar
@@ -191,7 +191,7 @@ class ExpectedFormer:
             elevation_fov_deg=elevation,
             beams=beams,
             beam_width_deg=None,
-            range_min=sonar.range_min - before * sonar.bin_m,
+            range_min=max(0.0, sonar.range_min - before * sonar.bin_m),  # not -1e-17 by rounding
             range_max=sonar.range_max + after * sonar.bin_m,
             range_bins=sonar.range_bins + before + after,
             **given,
@@ -236,8 +236,7 @@ class ExpectedFormer:
         row = (pulse.shape((apart[:, None] - share) * sonar.bin_m) ** 2).mean(axis=1) * sonar.bin_m / pulse.equivalent_m
         # 2. Arrange the row as a matrix, and scale each bin by its losses and gain.
         power = row[np.arange(sonar.range_bins)[:, None] + np.arange(bins)[::-1]]
-        factor = loss_of(sonar) * undone_absorption(sonar)
-        return np.asarray(power * factor[:, None], dtype=np.float32)
+        return np.asarray(power * net_loss(sonar)[:, None], dtype=np.float32)
 
     def levels(self, boxes: NDArray[np.float32]) -> NDArray[np.float32]:
         """Compute the levels ``(pings, bins, beams)`` from those of the traced boxes."""
@@ -251,7 +250,8 @@ class ExpectedFormer:
     def formed(self, pings: RenderedPings) -> RenderedPings:
         """Spread the levels of traced boxes over beams and pulse; the labels remain those of the boxes."""
         labels = {name: self.crop(values) for name, values in pings.labels.items()}
-        expected = self.crop(pings.echoes) if labels else None
+        left = net_loss(self.sonar).astype(np.float32)[:, None]
+        expected = self.crop(pings.echoes) * left if labels else None
         return RenderedPings(pings.first, self.levels(pings.levels), pings.counts, pings.height_m, labels, expected)
 
 
