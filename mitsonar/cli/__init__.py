@@ -39,27 +39,13 @@ def application() -> typer.Typer:
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    app.command()(render.render)
-    app.command()(render.impulse)
-    app.command()(render.image)
-    app.command()(render.sound)
-    app.command()(sas.sas)
-    app.command()(doctor.presets)
-    app.command()(doctor.materials)
-    app.command()(doctor.scenes)
-    app.command()(doctor.doctor)
-    app.command()(estimate.compare)
-    app.command()(estimate.crlb)
-    app.command()(estimate.height)
-    app.command()(heights.heights)
-    app.command()(estimate.odometry)
-    app.command()(estimate.mosaic)
-    app.command()(train.train)
-    app.command()(train.evaluate)
-    app.command()(train.export)
-    app.command()(train.reproduce)
-    app.command()(live.serve)
-    app.command()(live.view)
+    for command in (
+        *(render.render, render.impulse, render.image, render.sound, sas.sas),
+        *(doctor.presets, doctor.materials, doctor.scenes, doctor.doctor),
+        *(estimate.compare, estimate.crlb, estimate.height, heights.heights, estimate.odometry, estimate.mosaic),
+        *(train.train, train.evaluate, train.export, train.reproduce, live.serve, live.view),
+    ):
+        app.command()(command)
     app.add_typer(data.worlds(), name="world")
     app.add_typer(recording.sonars(), name="sonar")
     app.add_typer(data.datasets(), name="dataset")
