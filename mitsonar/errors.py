@@ -136,9 +136,9 @@ def suggest_names(wrong: str, names: Iterable[str]) -> str:
     known = list(names)
     similar = [name for name in known if wrong and wrong.lower() in name.lower()]
     similar = similar or difflib.get_close_matches(wrong.lower(), known, n=3, cutoff=0.5)
-    lengths = itertools.accumulate(len(name) + 2 for name in known)
-    listed = ", ".join(name for name, length in zip(known, lengths, strict=True) if length <= MAX_LIST_LENGTH)
-    if listed != ", ".join(known):
+    shown = sum(length <= MAX_LIST_LENGTH for length in itertools.accumulate(len(name) + 2 for name in known))
+    listed = ", ".join(known[:shown])
+    if shown < len(known):
         listed = f"{len(known)} names" if similar else f"{listed}, ... ({len(known)} names)"
     return f"did you mean {' or '.join(similar)}? Known: {listed}" if similar else f"known: {listed}"
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from mitsonar.errors import MitsonarError
 from mitsonar.io.files import write_atomic
+from mitsonar.io.ply import ply_bytes
 from mitsonar.mapping.height_map import HeightMap
 from mitsonar.mapping.mosaic import geotiff_bytes
 
@@ -52,14 +53,8 @@ def _ply(height_map: HeightMap) -> bytes:
     corners = [(north_west, south_west, south_east), (north_west, south_east, north_east)]
     faces = np.concatenate([np.column_stack(triangle) for triangle in corners])
     # 3. Positions of double precision: in single, eastings and northings of a map on the Earth are rounded to 0.5 m.
-    points = np.zeros(len(vertices), [("xyz", "<f8", 3), ("std_m", "<f4")])
-    points["xyz"], points["std_m"] = vertices, height_map.std_m[known]
-    triangles = np.zeros(len(faces), [("count", "u1"), ("corners", "<i4", 3)])
-    triangles["count"], triangles["corners"] = 3, faces
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    header += [*(f"property double {axis}" for axis in "xyz"), "property float std_m"]
-    header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header", ""]
-    return "\n".join(header).encode() + points.tobytes() + triangles.tobytes()
+    columns = {name: ("<f8", values) for name, values in zip("xyz", vertices.T, strict=True)}
+    return ply_bytes({**columns, "std_m": ("<f4", height_map.std_m[known])}, faces)
 
 
 def _geotiff(height_map: HeightMap) -> bytes:

@@ -18,7 +18,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from scipy.stats import chi2
 
 from mitsonar.errors import MitsonarError
-from mitsonar.mapping.series import LET_IT_TURN, CorrelatedErrors
+from mitsonar.mapping.series import YAW_ADVICE, CorrelatedErrors
 from mitsonar.motion.sensors import Headings, wrapped
 
 __all__ = [
@@ -80,7 +80,7 @@ class PoseEdges(NamedTuple):
             return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariances)))
         except np.linalg.LinAlgError:
             raise MitsonarError(
-                f"covariances of motions in a pose graph must be positive definite: got one that is not; {LET_IT_TURN}"
+                f"covariances of motions in a pose graph must be positive definite: got one that is not; {YAW_ADVICE}"
             ) from None
 
 

@@ -24,7 +24,7 @@ from mitsonar.motion.pose import Pose
 from mitsonar.motion.trajectory import Trajectory
 
 __all__ = [
-    "LET_IT_TURN",
+    "YAW_ADVICE",
     "CorrelatedErrors",
     "Ellipse",
     "ErrorCorrelation",
@@ -533,7 +533,7 @@ def _innovations(seen: Array, noise: Array, gap: Array, walk: Array) -> tuple[Ar
     return log_spread, chi
 
 
-LET_IT_TURN = "an estimator that takes the heading as constant states none for yaw: let it turn, as likelihood:yaw=1"
+YAW_ADVICE = "an estimator that takes the heading as constant states none for yaw: let it turn, as likelihood:yaw=1"
 """What to do where a covariance has no variance of yaw."""
 
 
@@ -542,7 +542,7 @@ def _variances(measured: MotionSeries) -> Array:
     variance = np.diagonal(np.asarray(measured.covariances), axis1=1, axis2=2)
     for axis, values in zip(AXES, variance[measured.is_valid].T, strict=True):
         if not (values > 0).all():
-            hint = f"; {LET_IT_TURN}" if axis.name == "yaw" else ""
+            hint = f"; {YAW_ADVICE}" if axis.name == "yaw" else ""
             raise MitsonarError(f"smoothing needs variances above zero: got {values.min():g} for {axis.name}{hint}")
     return variance
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.io.files import whole_file
+from mitsonar.io.ply import ply_header
 from mitsonar.io.runs import refuse_to_replace
 from mitsonar.motion.pose import vehicle_rotation
 from mitsonar.recordings.recording import Facts, in_time_order
@@ -120,7 +121,7 @@ def write_points(
         write_clouds(path, encoder, _clouds(recording, encoder, progress))
         return total
     with whole_file(path) as file:
-        file.write(_ply_header(total) if path.suffix == ".ply" else b"time_s,ping,x_m,y_m,z_m,intensity\n")
+        file.write(ply_header(PLY_ROW, total) if path.suffix == ".ply" else b"time_s,ping,x_m,y_m,z_m,intensity\n")
         for index, ping in enumerate(recording.pings()):
             xyz = recording.in_world(index, ping.points)
             if path.suffix == ".ply":
@@ -136,13 +137,6 @@ def write_points(
 
 
 PLY_ROW = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("intensity", "<f4")])
-
-
-def _ply_header(points: int) -> bytes:
-    names = {"<f8": "double", "<f4": "float"}
-    properties = [f"property {names[PLY_ROW[name].str]} {name}" for name in PLY_ROW.names or ()]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {points}", *properties, "end_header"]
-    return ("\n".join(lines) + "\n").encode()
 
 
 def _ply_rows(xyz: Array, intensity: NDArray[np.float32]) -> bytes:

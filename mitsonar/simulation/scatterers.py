@@ -794,7 +794,9 @@ class Scatterers:
                     raise MitsonarError(
                         f"scatterers cannot lie on instances: got {shape.id()}; give the scene meshes instead"
                     )
-                grid = _grid_of(shape) if sonar.scatterer_spacing_m is None and _is_covered_once(shape) else None
+                grid = _grid_of(shape) if sonar.scatterer_spacing_m is None else None
+                if grid is not None and not _is_covered_once(shape):
+                    grid = None
                 some = _in_cells(shape, grid, number) if grid else _on_lattice(shape, sonar, number, within)
                 if within is not None:
                     inside = ((some.place >= within[0]) & (some.place <= within[1])).all(axis=1)

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from mitsonar.errors import MitsonarError, validation_message
 from mitsonar.io.checked_model import CheckedModel
+from mitsonar.io.ply import ply_bytes
 
 if TYPE_CHECKING:
     import trimesh
@@ -190,30 +191,13 @@ class Mesh:
 
     def ply(self) -> bytes:
         """Return the mesh as a binary PLY file, with the attribute names that Mitsuba reads."""
-        # 1. Collect the columns of vertices and faces, and declare them in the header.
-        vertex_columns = {"x": self.vertices[:, 0], "y": self.vertices[:, 1], "z": self.vertices[:, 2]}
-        if self.uv is not None:
-            vertex_columns |= {"u": self.uv[:, 0], "v": self.uv[:, 1]}
-        face_columns: dict[str, NDArray[np.number]] = {}
-        if self.reflectivity is not None:
-            face_columns["reflectivity_0"] = self.reflectivity
-        if self.object_id is not None:
-            face_columns["id_0"] = self.object_id
-        header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(self.vertices)}"]
-        header += [f"property float {name}" for name in vertex_columns]
-        header += [f"element face {len(self.faces)}", "property list uchar int vertex_indices"]
-        header += [f"property float {name}" for name in face_columns]
-        # 2. Pack the columns into tables of little-endian rows.
-        vertex_rows = np.empty(len(self.vertices), [(name, "<f4") for name in vertex_columns])
-        for name, values in vertex_columns.items():
-            vertex_rows[name] = values
-        face_rows = np.empty(
-            len(self.faces), [("count", "u1"), ("corners", "<i4", 3), *((name, "<f4") for name in face_columns)]
+        places = self.vertices.T if self.uv is None else (*self.vertices.T, *self.uv.T)
+        faces = {"reflectivity_0": self.reflectivity, "id_0": self.object_id}
+        return ply_bytes(
+            {name: ("<f4", values) for name, values in zip("xyzuv", places, strict=False)},
+            self.faces,
+            {name: values for name, values in faces.items() if values is not None},
         )
-        face_rows["count"], face_rows["corners"] = 3, self.faces
-        for name, column in face_columns.items():
-            face_rows[name] = column
-        return "\n".join([*header, "end_header", ""]).encode() + vertex_rows.tobytes() + face_rows.tobytes()
 
     def xml(self) -> str:
         """Return the XML of the shape."""

@@ -187,9 +187,8 @@ class GroupedPings:
 
     def _of_beams(self, count: NDArray[np.int64], group: NDArray[np.int64], beam: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the ray counts of the frame's beams, or their total if the pings do not count rays for each beam."""
-        margin = (
-            count.shape[1] - (1 if scans(self.sonar) else self.sonar.beams)
-        ) // 2  # boxes traced on each side of the fan
+        beams = 1 if scans(self.sonar) else self.sonar.beams
+        margin = (count.shape[1] - beams) // 2  # boxes traced on each side of the fan
         if margin < 0:
             return np.asarray([[count.sum()]])
         return np.asarray(count[group, beam + margin][None])
