@@ -138,9 +138,10 @@ def suggest_names(wrong: str, names: Iterable[str]) -> str:
     similar = similar or difflib.get_close_matches(wrong.lower(), known, n=3, cutoff=0.5)
     shown = sum(length <= MAX_LIST_LENGTH for length in itertools.accumulate(len(name) + 2 for name in known))
     listed = ", ".join(known[:shown])
+    guess = f"did you mean {' or '.join(similar)}?" if similar else ""
     if shown < len(known):
-        listed = f"{len(known)} names" if similar else f"{listed}, ... ({len(known)} names)"
-    return f"did you mean {' or '.join(similar)}? Known: {listed}" if similar else f"known: {listed}"
+        return guess or f"known: {listed}, ... ({len(known)} names)"
+    return f"{guess} Known: {listed}" if guess else f"known: {listed}"
 
 
 def count_noun(number: int, noun: str, plural: str = "") -> str:

@@ -398,10 +398,14 @@ def echo_heights(frames: SonarFrames, pitch_rad: float, roll_rad: float) -> Echo
 
 
 def _down(frames: SonarFrames, pitch: float, roll: float, *, far: bool) -> Doubles:
-    """Return the downward component of the shallowest (``far``) or steepest ray of each beam ``(beams,)``."""
-    half = np.radians(frames.sonar.elevation_fov_deg) / 2
-    ray = directions(frames.sonar.bearing, frames.bearing_rad, half if far else -half)
-    return np.asarray(-vehicle_rotation(Pose(0, 0, 0, pitch, roll, 0)).apply(ray)[:, 2])
+    """Return the downward component of the shallowest (``far``) or steepest edge of each beam ``(beams,)``.
+
+    Of a sonar that is mounted upside down the upper edge is the steepest.
+    """
+    half, rotation = np.radians(frames.sonar.elevation_fov_deg) / 2, vehicle_rotation(Pose(0, 0, 0, pitch, roll, 0))
+    edges = (directions(frames.sonar.bearing, frames.bearing_rad, edge) for edge in (-half, half))
+    down = [-rotation.apply(ray)[:, 2] for ray in edges]
+    return np.asarray(np.min(down, axis=0) if far else np.max(down, axis=0))
 
 
 class _Ends(NamedTuple):

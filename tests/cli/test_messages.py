@@ -340,7 +340,6 @@ def test_of_many_names_the_nearest_or_the_first_are_listed() -> None:
     """A sonar has more than 60 keys."""
     assert suggest_names("c", ["ab", "cd"]) == "did you mean cd? Known: ab, cd"
     many = [f"name_{number}" for number in range(100)]
-    assert suggest_names("name_77x", many).startswith("did you mean name_77 ")
-    assert suggest_names("name_77x", many).endswith("? Known: 100 names")
+    assert suggest_names("name_77x", many) == "did you mean name_77 or name_7 or name_97?"
     assert suggest_names("?", many).startswith("known: name_0, name_1, ")
     assert suggest_names("?", many).endswith(", name_55, ... (100 names)")

@@ -149,6 +149,14 @@ def test_a_sonar_upside_down_rolls_about_half_a_turn() -> None:
     assert [result.of_frame(k)[2] for k in range(2)] == pytest.approx([np.pi - 0.02, np.pi + 0.04])
 
 
+def test_first_echoes_of_a_sonar_upside_down_come_from_its_upper_edge() -> None:
+    frames, _, _ = lit_plane(SONAR, HEIGHT_M, PITCH_RAD)
+    first, turned = (echo_heights(frames, PITCH_RAD, roll).first for roll in (0.0, np.pi))
+    assert first is not None
+    assert turned is not None
+    assert turned.height_m == pytest.approx(first.height_m)
+
+
 @pytest.mark.parametrize(("given_m", "told"), [(2500.0, True), (0.5, True), (HEIGHT_M, False), (None, False)])
 def test_a_height_beyond_both_ends_of_rising_ground_is_told(given_m: float | None, told: bool) -> None:
     """A height in millimetres, say: the ends of the light count, and the contradiction is reported."""
