@@ -461,7 +461,7 @@ class GroundProblem:
         if lit < LEAST_SIGNAL:
             raise MitsonarError(
                 f"the frames show no ground above the noise: {lit:.0%} of the blocks, {LEAST_SIGNAL:.0%} are needed; give "
-                "frames of level ground"
+                "frames of level ground, and check the height and the pitch"
             )
         judged = self.valid & self.within_pattern(solution.values)
         level = np.log((self.mean / self.noise_gain)[judged])
