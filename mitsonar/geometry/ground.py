@@ -608,6 +608,11 @@ class Attitude:
         return 0.0 if self.first is None else self.first.tops_m
 
     @property
+    def lean_std(self) -> Doubles:
+        """Standard deviations of ``unsure`` [m, rad, rad] and of the mean pitch and roll [rad] ``(5,)``."""
+        return np.array([*self.unsure, *self.mean_unsure[1:]])
+
+    @property
     def about(self) -> dict[str, str]:
         """Return notes on the attitude that an estimate must report: a doubt, if there is one."""
         return {"doubt": self.doubt} if self.doubt else {}

@@ -79,18 +79,12 @@ LEVELS = (
 )
 """Coarse to fine, for frames of linear levels, whose beams have hard edges."""
 
-LEVELS_CODED = (*LEVELS[:-1], DirectLevel(1, (0.5, 0.5), (0.6, 0.4), 24))
+LEVELS_CODED = (*LEVELS[:-1], DirectLevel(1, (0.3, 0.3), (0.3, 0.3), 24))
 """Coarse to fine, for frames in decibels and other coded levels: their overlapping beams and pulses smooth them already.
 
 Errors in speckle are 5 to 20 % smaller than with :data:`LEVELS`; for beams with hard edges they would be 5 to 8 % larger.
 Removing content as coarse as the illumination would reduce them by another 5 %, but then loops of a recording close at
 wrong places.
-"""
-
-MODEL = 1.4
-"""Squared errors over the jackknife's covariance, measured at 60 places over rocky fields with six sonars.
-
-They range from 0.9 to 2.3 in speckle and from 0.7 to 1.8 in static texture.
 """
 
 FAR_MODEL = 1.6
@@ -109,8 +103,12 @@ FARTHEST = np.array([0.15, 0.15, np.radians(3)])
 CLEARLY_FAR = 1.2
 """Motions this many times farther than :data:`FAR` count as far, whatever the finest level would show."""
 
-FAR, FAR_RAD = 0.02, float(np.radians(1.5))
-"""Motions beyond this fraction of the height, or this turn, are far: relief dominates, and ``phase`` finds missed ones."""
+FAR, FAR_CODED, FAR_RAD = 0.02, 0.05, float(np.radians(1.5))
+"""Motions beyond this fraction of the height, or this turn, are far: relief dominates, and ``phase`` finds missed ones.
+
+In speckle, which also covers the ground between rocks, relief dominates later: up to 5 % of the height, errors would be 1.3
+to 1.6 times larger over relief.
+"""
 
 ROCKY_FIELD_STEEPNESS = 0.32
 """Squared ratio of height to range over rocky fields. Relief moves less at more grazing angles, as on a plate at 0.3 m."""
@@ -146,6 +144,11 @@ class _Task:
         """Height [m] from which relief would move as it does here if seen as steeply as on rocky fields."""
         middle_m = float(self.frames.range_m[[0, -1]].mean())
         return max(self.attitude.height_m, ROCKY_FIELD_STEEPNESS * middle_m**2 / self.attitude.height_m)
+
+    @property
+    def far_m(self) -> float:
+        """Length of a motion beyond which relief dominates its error [m]."""
+        return (FAR if self.frames.level == "linear" else FAR_CODED) * self.relief_m
 
     @cached_property
     def shadows(self) -> tuple[Floats, Floats] | None:
@@ -217,7 +220,7 @@ class Direct:
         if (near.valid and near.about.get("distinct", True)) or (prior is not None and (3 * prior.std <= FARTHEST).all()):
             return near
         phase_estimate = Phase(self.height_m, self.pitch_rad, self.relief_m).estimate(frames)
-        if not phase_estimate.valid or not is_far(phase_estimate.motion, attitude.height_m):
+        if not phase_estimate.valid or not is_far(phase_estimate.motion, FAR * attitude.height_m):
             return near  # the first registration has already searched near motions
         far = self._estimate_from(replace(task, prior=None), phase_estimate.motion, "phase")
         reason = far.reason or prior_rejection(far.motion, far.covariance, prior)
@@ -227,12 +230,12 @@ class Direct:
         """Register from a start: over level ground while the motion is near, over relief if it is far."""
         if self.heave_std_m:
             return self._over_level(task, start, start_name)
-        if not is_far(start, task.relief_m):
+        if not is_far(start, task.far_m):
             near = self._over_level(task, start, start_name, until_far=True)
             if isinstance(near, Motion):
                 far = self._over_relief(task, start, near, start_name)
                 return far if far.valid else self._over_level(task, start, start_name)
-            if not near.valid or not is_far(near.motion, task.relief_m):
+            if not near.valid or not is_far(near.motion, task.far_m):
                 return near
             far = self._over_relief(task, start, near.motion, start_name)
             return far if far.valid else near
@@ -261,7 +264,7 @@ class Direct:
             last = number + 1 == len(levels)
             if not last and not is_resolved(len(task.images[0]), level):
                 continue
-            if last and until_far and is_far(Motion(*v[:3].tolist()), CLEARLY_FAR * task.relief_m):
+            if last and until_far and is_far(Motion(*v[:3].tolist()), CLEARLY_FAR * task.far_m):
                 return Motion(*v[:3].tolist())
             pair = smoothed(task.images[0], level), smoothed(task.images[1], level)
             cells = Cells(nodes, level, task.shadows)
@@ -271,7 +274,7 @@ class Direct:
             v, fit = registration
         assert fit is not None
         about = {"heave_m": float(v[3])} if self.heave_std_m else {}
-        return self._estimate_of_fit(task, start, v[:3], fit, MODEL, {**about, "start": start_name})
+        return self._estimate_of_fit(task, start, v[:3], fit, {**about, "start": start_name})
 
     def _levels(self, task: _Task) -> tuple[DirectLevel, ...]:
         """Return the levels to run; skip those coarser than one that covers the uncertainty of the prior."""
@@ -294,22 +297,15 @@ class Direct:
         registration = registered_over_relief(task.images, task.frames, task.attitude, np.array(near), task.shadows)
         if registration is None:
             return replace(rejected("nothing in the frames to match"), about={"start": start_name})
-        # far motions also match the ground between rocks, since rocks look different from elsewhere
-        std = float(np.hypot(task.attitude.height_std_m, task.attitude.tops_m))
-        uncertain_task = replace(task, attitude=replace(task.attitude, height_std_m=std))
-        return self._estimate_of_fit(uncertain_task, start, *registration, FAR_MODEL, {"start": start_name})
+        return self._estimate_of_fit(task, start, *registration, {"start": start_name})
 
     def _estimate_of_fit(
-        self, task: _Task, start: Motion, v: NDArray[np.float64], fit: Fit, model: float, about: dict[str, object]
+        self, task: _Task, start: Motion, v: NDArray[np.float64], fit: Fit, about: dict[str, object]
     ) -> Estimate:
         """Return the estimate with its covariance, rejected if it must not be used."""
-        by_height = fit.by_height[:3] * task.attitude.height_std_m
-        covariance = model * fit.covariance[:3, :3] + np.outer(by_height, by_height)
+        covariance = fit.covariance + fit.by_unknown @ fit.by_unknown.T
         motion = Motion(*(float(x) for x in v))
         reason = _rejection(fit, covariance, v - np.array(start))
-        unsure = np.array([*task.attitude.unsure, *task.attitude.mean_unsure[1:]])
-        by_lean = fit.by_lean[:3] * unsure * ([0, 1, 1, 1, 1] if self.heave_std_m else 1)
-        covariance = covariance + by_lean @ by_lean.T
         reason = reason or prior_rejection(motion, covariance, task.prior)
         about = {"correlation": fit.correlation, "height_m": task.attitude.height_m, **about, **task.attitude.about}
         if fit.excess != UNMEASURED:
@@ -342,9 +338,9 @@ def _resolved(frames: SonarFrames, images: tuple[Floats, Floats]) -> tuple[Sonar
     return replace(frames, image=image, range_m=range_m, bearing_rad=bearing_rad, **unset_fields), (image[0], image[1])
 
 
-def is_far(motion: Motion, height_m: float) -> bool:
-    """Return whether relief dominates the error of a motion seen from this height [m]."""
-    return bool(np.hypot(motion.sideways, motion.forward) > FAR * height_m or abs(motion.yaw) > FAR_RAD)
+def is_far(motion: Motion, far_m: float) -> bool:
+    """Return whether a motion is longer than this [m], or turns farther than :data:`FAR_RAD`."""
+    return bool(np.hypot(motion.sideways, motion.forward) > far_m or abs(motion.yaw) > FAR_RAD)
 
 
 def _rejection(fit: Fit, covariance: NDArray[np.float64], from_start: NDArray[np.float64]) -> str:
@@ -371,7 +367,7 @@ Pair = tuple[Floats, Floats]
 RELIEF_LEVELS = (
     DirectLevel(4, (6.0, 1.5), (0.0, 0.0), 6),
     DirectLevel(2, (2.0, 0.8), (0.0, 0.0), 6),
-    DirectLevel(1, (0.4, 0.3), (0.5, 0.4), 12),
+    DirectLevel(1, (0.3, 0.3), (0.3, 0.3), 12),
 )
 """Coarse to fine: the first reaches 50 mm and 1 deg from the start; the last is finer than that of near motions."""
 
@@ -699,18 +695,11 @@ def registered_over_relief(
     equations = relief_level.without_noise(equations, prior, v, heights)
     if equations is None:
         return None
-    lean_gradients = relief_level.gradients_by_lean(v, heights) if any(attitude.unsure) else None
-    return v, _assessed(equations, prior, heights - relief_level.mean, relief_level, lean_gradients, converged=converged)
+    return v, _assessed(equations, prior, v, heights, relief_level, converged=converged)
 
 
 def _assessed(
-    equations: _Equations,
-    prior: float,
-    height_offsets: Doubles,
-    level: _ReliefLevel,
-    lean_gradients: Doubles | None,
-    *,
-    converged: bool,
+    equations: _Equations, prior: float, v: Doubles, heights: Doubles, level: _ReliefLevel, *, converged: bool
 ) -> Fit:
     """Return the fit: covariance, and sensitivity to the mean height and to differences of height, pitch and roll.
 
@@ -718,7 +707,7 @@ def _assessed(
     relief.
     """
     # motion per gradient, with the heights eliminated
-    normals, gradients = equations.reduced_normals(prior), equations.reduced_gradients(prior, height_offsets)
+    normals, gradients = equations.reduced_normals(prior), equations.reduced_gradients(prior, heights - level.mean)
     normal = normals.sum(axis=-1)
     inverse = np.linalg.inv(normal)
     # the change without each of the blocks gives the covariance; where one holds all information, it is very large
@@ -728,16 +717,19 @@ def _assessed(
     remaining = normal[..., None] * (1 + 1e-9) - left_out
     changes = np.linalg.solve(np.moveaxis(remaining, -1, 0), pulls.T[..., None])[..., 0]
     prior_weight = equations.noise * prior
-    # these differences change the gradients of both motion and heights; eliminate the heights as above
-    by_lean = np.zeros((3, 5))
-    if lean_gradients is not None:
-        reduced = lean_gradients[:, :3] - equations.cross * (lean_gradients[:, 3:] / (equations.height + prior_weight))
-        by_lean = inverse @ reduced.sum(axis=-1).T
+    # far motions also match the ground between rocks, since rocks look different from elsewhere
+    attitude, prior_weight = level.nodes.attitude, equations.noise * prior
+    height_std = float(np.hypot(attitude.height_std_m, attitude.tops_m))
+    by_unknown = [inverse @ (equations.cross @ (prior_weight / (equations.height + prior_weight))) * height_std]
+    if any(attitude.unsure):
+        # these differences change the gradients of both motion and heights; eliminate the heights as above
+        lean = level.gradients_by_lean(v, heights)
+        reduced = lean[:, :3] - equations.cross * (lean[:, 3:] / (equations.height + prior_weight))
+        by_unknown += list(attitude.lean_std[:, None] * (reduced.sum(axis=-1) @ inverse))
     return Fit(
         converged=converged,
-        covariance=np.asarray(changes.T @ changes, dtype=np.float64),
-        by_height=inverse @ (equations.cross @ (prior_weight / (equations.height + prior_weight))),
-        by_lean=by_lean,
+        covariance=np.asarray(FAR_MODEL * (changes.T @ changes), dtype=np.float64),
+        by_unknown=np.stack(by_unknown, axis=1),
         correlation=equations.correlation,
         independent=equations.cells / correlated_cells(level.level),
         blocks=spread_of(equations.height),

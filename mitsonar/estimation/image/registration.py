@@ -62,6 +62,15 @@ CORRELATED_PATCHES = (3, 2)
 SURROUNDING_PATCHES = (3, 3)
 """Patches along beams and bins around each patch that are assessed as one block."""
 
+MODEL = 1.4
+"""Squared errors over the jackknife's covariance, measured at 60 places over rocky fields with six sonars.
+
+They range from 0.9 to 2.3 in speckle and from 0.7 to 1.8 in static texture.
+"""
+
+SURFACE_SLOPE_STD = float(np.radians(1))
+"""Standard deviation of the slope of the surface, forward and to starboard, and of the attitude over it."""
+
 BLOCK_CAUCHY = 4.0
 """Blocks have half the weight if their individual best shift explains this many times (squared) what it usually does."""
 
@@ -96,10 +105,9 @@ class Fit(NamedTuple):
 
     Attributes:
         converged: whether the iteration settled.
-        covariance: of the unknowns, from the residuals.
-        by_height: derivative of the motion by the height ``(3,)``.
-        by_lean: derivative of the motion by the excess of height, pitch and roll of the second frame over the first, and by
-            the pitch and roll of both ``(3, 5)``. The signs of both derivatives do not matter to a covariance.
+        covariance: of the motion, from the residuals ``(3, 3)``.
+        by_unknown: change of the motion by one standard deviation of what else is uncertain: the surface, and the attitude
+            of the frames ``(3, unknowns)``. Signs do not matter to a covariance.
         correlation: of the registered frames.
         independent: number of cells with independent noise.
         blocks: effective number of blocks that share the information.
@@ -108,8 +116,7 @@ class Fit(NamedTuple):
 
     converged: bool
     covariance: Doubles
-    by_height: Doubles
-    by_lean: Doubles
+    by_unknown: Doubles
     correlation: float
     independent: float
     blocks: float
@@ -167,8 +174,8 @@ def register(
     if not last or linearisation is None:
         return v, None
     # a long step is acceptable if it is small against the uncertainty of the estimate
-    fit = _fit(linearisation, cells, v, level, prior.weight(linearisation.scale, level), converged)
-    return v, fit if converged else fit._replace(converged=_is_small(step[:3], fit.covariance[:3, :3]))
+    correction, fit = _fit(linearisation, cells, v, level, weight, gradient, converged)
+    return v + correction, fit if converged else fit._replace(converged=_is_small(step[:3], fit.covariance))
 
 
 def _is_small(step: Doubles, covariance: Doubles) -> bool:
@@ -311,40 +318,63 @@ def _information(derivative: Doubles, slopes: Doubles) -> Doubles:
 
 
 def _fit(
-    linearisation: _Linearisation, cells: Cells, v: Doubles, level: DirectLevel, prior_weight: Doubles, converged: bool
-) -> Fit:
-    """Assess the motion from slopes of one frame times those of the other, and from the gradients of blocks.
+    linearisation: _Linearisation,
+    cells: Cells,
+    v: Doubles,
+    level: DirectLevel,
+    prior_weight: Doubles,
+    gradient: Doubles,
+    converged: bool,
+) -> tuple[Doubles, Fit]:
+    """Correct the motion for the surface and the attitude that the frames show, and assess it.
 
-    The gradients include all errors common to a block, in both directions of resampling: noise, speckle, relief.
+    Whatever else displaces the ground has a Gaussian prior of unit variance: see :meth:`GroundNodes.unknown_shift`. A
+    surface that lies lower than assumed moves more slowly in the near part of a frame than in the far part, and the
+    residuals show it. How far they count follows from the gradients of blocks, which include all errors common to a block,
+    in both directions of resampling: noise, speckle, relief.
+
+    Returns:
+        What to add to the motion and heave ``(3 or 4,)``, and the fit.
     """
+    own = len(cells.derivative)
+    derivative = np.concatenate([cells.derivative, cells.unknown_shift(v)])
     # curvature without the noise of the slopes, which is independent in the two frames
-    information = _information(
-        cells.derivative, np.sum([_cross(side, cells, level) for side in linearisation.sides], axis=0)
-    )
-    curvature = _flat(information) @ _flat(cells.derivative).T
-    # exactly symmetric: sums of float32 are not, and a path refuses such covariances
-    normal = curvature if np.linalg.eigvalsh(curvature)[0] > 0 else (linearisation.normal + linearisation.normal.T) / 2
-    inverse = np.linalg.inv(normal + np.diag(prior_weight))
-    # the jackknife over blocks gives the covariance of what the frames contribute
-    changes = _jackknife(normal + np.diag(prior_weight), information, linearisation, cells)
-    # the error of the prior adds to it: where the frames hold no information, it is all there is
-    prior_part = inverse * (correlated_cells(level) * linearisation.scale**2 * prior_weight) @ inverse.T
-    # share of each block in the information, and sensitivity to the height and to differences of height, pitch and roll
-    first = linearisation.sides[0]
-    informations = [_information(cells.derivative, one.slopes) for one in linearisation.sides]
-    shares = _by_correlated_block((np.tensordot(inverse, informations[0], 1) * cells.derivative).sum(axis=(0, 1)), cells)
-    by_height, by_lean = (
-        inverse @ np.sum([_flat(one) @ _flat(shift).T for one in informations], axis=0)
-        for shift in (cells.lifted_shift(v)[None], cells.leaning_shift(v))
-    )
+    information = _information(derivative, np.sum([_cross(side, cells, level) for side in linearisation.sides], axis=0))
+    normal = _flat(information) @ _flat(derivative).T
+    if np.linalg.eigvalsh(normal[:own, :own])[0] <= 0:
+        information = np.sum([_information(derivative, side.slopes) for side in linearisation.sides], axis=0)
+        normal = _flat(information) @ _flat(derivative).T
+    normal = (normal + normal.T) / 2  # exactly symmetric: sums of float32 are not, and a path refuses such covariances
+    noise = correlated_cells(level) * linearisation.scale**2
+    motion_normal, mixed = normal[:own, :own] + np.diag(prior_weight), normal[:own, own:]
+    inverse = np.linalg.inv(motion_normal)
     # a match that hardly differs from displaced ones has a larger covariance
+    first = linearisation.sides[0]
     before, after = first.before[first.inner], first.after[first.inner]
     independent, excess = before.size / correlated_cells(level), _excess(first, cells)
-    return Fit(
+    model = MODEL * ambiguity(excess.mean, independent)
+    # gradients of the blocks ``(unknowns, blocks)``, as they would be with the block left out
+    full = normal + np.diag(np.append(prior_weight, np.full(len(normal) - own, noise)))
+    gradients = full @ _jackknife(full, information, derivative, linearisation, cells)
+    # eliminate the motion: what the residuals say of the other unknowns, and how far they contradict each other in it
+    by_unknown = -inverse @ mixed
+    known, axes = np.linalg.eigh(normal[own:, own:] + mixed.T @ by_unknown)
+    known = (axes * np.maximum(known, 0)) @ axes.T
+    reduced = gradients[own:] + by_unknown.T @ gradients[:own]
+    gain = known @ np.linalg.pinv(known @ known + model * reduced @ reduced.T, hermitian=True)
+    others = np.sum([(derivative[own:] * side.gradients).sum(axis=(1, 2)) for side in linearisation.sides], axis=0)
+    # errors of the motion from the blocks, and from the prior where the frames hold no information
+    changes = inverse @ gradients[:own] + by_unknown @ gain @ reduced
+    prior_part = inverse * (noise * prior_weight) @ inverse.T
+    covariance = model * (changes @ changes.T) + (prior_part + prior_part.T) / 2
+    # share of each block in the information
+    shares = _by_correlated_block(
+        (np.tensordot(inverse, _information(cells.derivative, first.slopes), 1) * cells.derivative).sum(axis=(0, 1)), cells
+    )
+    return -by_unknown @ gain @ (others + by_unknown.T @ gradient), Fit(
         converged=converged,
-        covariance=ambiguity(excess.mean, independent) * (changes @ changes.T + (prior_part + prior_part.T) / 2),
-        by_height=by_height[:, 0],
-        by_lean=by_lean,
+        covariance=covariance[:3, :3],
+        by_unknown=(by_unknown @ (np.eye(len(known)) - gain @ known))[:3],
         correlation=correlation_of(before, after),
         independent=independent,
         blocks=spread_of(shares),
@@ -352,13 +382,15 @@ def _fit(
     )
 
 
-def _jackknife(normal: Doubles, information: Doubles, linearisation: _Linearisation, cells: Cells) -> Doubles:
-    """Return the change of the motion without each of the blocks ``(n, blocks)``: the jackknife.
+def _jackknife(
+    normal: Doubles, information: Doubles, derivative: Doubles, linearisation: _Linearisation, cells: Cells
+) -> Doubles:
+    """Return the change of the unknowns without each of the blocks ``(n, blocks)``: the jackknife.
 
     Blocks that hold much of the information have small gradients, since the motion follows them.
     """
-    gradients = np.sum([(cells.derivative * side.gradients).sum(axis=1) for side in linearisation.sides], axis=0)
-    of_patches = np.einsum("ikp,jkp->ijp", information, cells.derivative)
+    gradients = np.sum([(derivative * side.gradients).sum(axis=1) for side in linearisation.sides], axis=0)
+    of_patches = np.einsum("ikp,jkp->ijp", information, derivative)
     remaining = normal - np.moveaxis(_by_correlated_block((of_patches + np.swapaxes(of_patches, 0, 1)) / 2, cells), -1, 0)
     change = np.linalg.solve(remaining, np.moveaxis(_by_correlated_block(gradients, cells), -1, 0)[..., None])
     return np.asarray(change[..., 0].T)
@@ -567,17 +599,13 @@ class Cells:
             shift[1] += translation.ravel()[self.casters[int(back)]] - translation
         return shift
 
-    def lifted_shift(self, v: Doubles) -> Doubles:
-        """Return the derivative of :meth:`shift` by the height at the centres of the patches ``(2, patches)`` [1/m]."""
-        return self._on_patches(self.nodes.lifted_shift(v))
-
     def leaning_shift_of_cells(self, v: Doubles) -> list[Floats]:
         """Return the derivatives of :meth:`GroundNodes.leaning_shift`, each ``(2, bins, beams)``."""
         return [self._on_all(nodes) for nodes in self.nodes.leaning_shift(v)]
 
-    def leaning_shift(self, v: Doubles) -> Doubles:
-        """Return the derivatives of :meth:`leaning_shift_of_cells` at the patch centres ``(5, 2, patches)``."""
-        return self._on_patches(self.nodes.leaning_shift(v))
+    def unknown_shift(self, v: Doubles) -> Doubles:
+        """Return the derivatives of :meth:`GroundNodes.unknown_shift` at the patch centres ``(unknowns, 2, patches)``."""
+        return self._on_patches(self.nodes.unknown_shift(v))
 
 
 class CellGrid(NamedTuple):
@@ -796,6 +824,23 @@ class GroundNodes:
                 ends.append(self._between(ground, other_ground, v[:3]))
             changes.append((ends[1] - ends[0]) / (2 * LEAN_STEP))
         return np.nan_to_num(np.stack(changes)[:, :, row, column])
+
+    def unknown_shift(self, v: Doubles) -> Doubles:
+        """Return the change of :meth:`shift` by one standard deviation of all that is uncertain.
+
+        Returns:
+            For a higher sonar, and a surface that rises forward and to starboard about the middle of the view; and where the
+            attitude is uncertain, for :meth:`leaning_shift`: ranges [m] and bearings [rad] ``(3 or 8, 2, nodes, nodes)``.
+        """
+        lifted, points = self.lifted_shift(v), self.ground.points[self.from_node]
+        starboard, forward = points[..., 0], points[..., 1]
+        forward = forward - np.median(forward)  # the height is that over the middle of the view
+        rises = self.attitude.height_std_m, SURFACE_SLOPE_STD * forward, SURFACE_SLOPE_STD * starboard
+        surface = np.stack([lifted * rise for rise in rises])
+        if not any(self.attitude.unsure):
+            return np.nan_to_num(surface)
+        std = self.attitude.lean_std * ([0, 1, 1, 1, 1] if self.heave else 1)
+        return np.nan_to_num(np.concatenate([surface, self.leaning_shift(v) * std[:, None, None, None]]))
 
     def lifted_shift(self, v: Doubles) -> Doubles:
         """Return the derivative of :meth:`shift` by the height [m/m, rad/m]."""

@@ -161,9 +161,9 @@ def test_an_unknown_component_does_not_hide_a_known_one() -> None:
 
 
 def test_far_is_by_height_and_turn() -> None:
-    assert not is_far(Motion(0.03, 0.03, 0.02), 2.5)
-    assert is_far(Motion(0.03, 0.03, 0.02), 2.0)
-    assert is_far(Motion(0.0, 0.0, -0.03), 2.5)
+    assert not is_far(Motion(0.03, 0.03, 0.02), 0.05)
+    assert is_far(Motion(0.03, 0.03, 0.02), 0.04)
+    assert is_far(Motion(0.0, 0.0, -0.03), 0.05)
 
 
 def test_sums_over_blocks_and_values_on_cells() -> None:
