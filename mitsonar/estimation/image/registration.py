@@ -68,6 +68,12 @@ MODEL = 1.4
 They range from 0.9 to 2.3 in speckle and from 0.7 to 1.8 in static texture.
 """
 
+SURFACE = 3
+"""Unknowns of the surface: its height, and its rise forward and to starboard."""
+
+DISPLACEMENT_STD = 0.03
+"""Standard deviation of displacements [bins, beams] that no motion explains: aliasing, and distortion of the pictures."""
+
 SURFACE_SLOPE_STD = float(np.radians(1))
 """Standard deviation of the slope of the surface, forward and to starboard, and of the attitude over it."""
 
@@ -356,25 +362,29 @@ def _fit(
     # gradients of the blocks ``(unknowns, blocks)``, as they would be with the block left out
     full = normal + np.diag(np.append(prior_weight, np.full(len(normal) - own, noise)))
     gradients = full @ _jackknife(full, information, derivative, linearisation, cells)
-    # eliminate the motion: what the residuals say of the other unknowns, and how far they contradict each other in it
+    # eliminate the motion: what the residuals say of the other unknowns, and how far the blocks contradict each other in it
     by_unknown = -inverse @ mixed
     known, axes = np.linalg.eigh(normal[own:, own:] + mixed.T @ by_unknown)
     known = (axes * np.maximum(known, 0)) @ axes.T
     reduced = gradients[own:] + by_unknown.T @ gradients[:own]
-    gain = known @ np.linalg.pinv(known @ known + model * reduced @ reduced.T, hermitian=True)
+    # displacements that nothing explains would pass for the attitude
+    unexplained = np.zeros_like(known)
+    slopes = float(np.sum([side.slopes[::2].sum() for side in linearisation.sides])) / 2
+    unexplained[SURFACE:, SURFACE:] = DISPLACEMENT_STD**2 * slopes * known[SURFACE:, SURFACE:]
+    gain = by_unknown @ known @ np.linalg.pinv(known @ known + model * reduced @ reduced.T + unexplained, hermitian=True)
     others = np.sum([(derivative[own:] * side.gradients).sum(axis=(1, 2)) for side in linearisation.sides], axis=0)
     # errors of the motion from the blocks, and from the prior where the frames hold no information
-    changes = inverse @ gradients[:own] + by_unknown @ gain @ reduced
+    changes = inverse @ gradients[:own] + gain @ reduced
     prior_part = inverse * (noise * prior_weight) @ inverse.T
-    covariance = model * (changes @ changes.T) + (prior_part + prior_part.T) / 2
+    covariance = model * (changes @ changes.T) + (prior_part + prior_part.T) / 2 + gain @ unexplained @ gain.T
     # share of each block in the information
     shares = _by_correlated_block(
         (np.tensordot(inverse, _information(cells.derivative, first.slopes), 1) * cells.derivative).sum(axis=(0, 1)), cells
     )
-    return -by_unknown @ gain @ (others + by_unknown.T @ gradient), Fit(
+    return -gain @ (others + by_unknown.T @ gradient), Fit(
         converged=converged,
         covariance=covariance[:3, :3],
-        by_unknown=(by_unknown @ (np.eye(len(known)) - gain @ known))[:3],
+        by_unknown=(by_unknown - gain @ known)[:3],
         correlation=correlation_of(before, after),
         independent=independent,
         blocks=spread_of(shares),
