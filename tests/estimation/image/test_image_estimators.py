@@ -184,6 +184,31 @@ def test_a_wrong_height_of_a_sonar_that_rolls_is_within_the_covariance() -> None
     assert shift @ np.linalg.solve(message.covariance, shift) < 2
 
 
+def test_frames_show_that_the_height_is_wrong() -> None:
+    """At the middle of the window, a height of 2.6 m for 2.5 makes 40 mm forward 2 % too long: 0.8 mm."""
+    poses = np.array([[0, 0, 2.5, np.radians(35), 0, 0], [0, 0.04, 2.5, np.radians(35), 0, 0]])
+    frames = over_ground(Trajectory(poses, np.array([0.0, 0.1])), load_sonar("didson300").replace(model="physical"))
+    results = [Direct(height_m=height_m, relief_m=0.0).estimate(frames) for height_m in (2.4, 2.5, 2.6)]
+    errors = np.array([result.motion for result in results]) - [0, 0.04, 0]
+    assert np.abs(errors[:, 1]).max() < 5e-4
+    for error, result in zip(errors, results, strict=True):
+        assert result.covariance is not None
+        assert error @ np.linalg.solve(result.covariance, error) < 3 * 3
+
+
+def test_frames_show_heave_and_lean_that_nothing_measured() -> None:
+    """A rise of 6 mm looks like 4 mm backward, a roll of 0.3 deg like a turn and a motion aside."""
+    sonar = load_sonar("didson300").replace(model="physical")
+    second = [0.0, 0.04, 2.506, np.radians(35.2), np.radians(0.3), 0.0]
+    poses = np.array([[0, 0, 2.5, np.radians(35), 0, 0], second])
+    frames = changed(over_ground(Trajectory(poses, np.array([0.0, 0.1])), sonar), poses=None)
+    result = Direct(height_m=2.503, pitch_rad=np.radians(35.1), relief_m=0.0).estimate(frames)
+    error = np.array(result.motion) - [0, 0.04, 0]
+    assert (np.abs(error) < [1e-3, 5e-4, np.radians(0.02)]).all(), f"mm, mm, deg: {error * UNITS}"
+    assert result.covariance is not None
+    assert error @ np.linalg.solve(result.covariance, error) < 3 * 3
+
+
 def test_swapped_frames_tell_the_opposite_motion(pair: Pair) -> None:
     """The way back: direct treats both frames alike, so that the middle frame's motion only changes its sign, up to
     the step at which its iteration ends, which differs between processors."""
