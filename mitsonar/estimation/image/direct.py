@@ -109,8 +109,8 @@ CLEARLY_FAR = 1.2
 FAR, FAR_CODED, FAR_RAD = 0.02, 0.05, float(np.radians(1.5))
 """Motions beyond this fraction of the height, or this turn, are far: relief dominates, and ``phase`` finds missed ones.
 
-In speckle, which also covers the ground between rocks, relief dominates later: up to 5 % of the height, errors would be 1.3
-to 1.6 times larger over relief.
+In speckle, which also covers the ground between rocks, relief dominates later: up to 5 % of the height, errors over relief
+would be 1.3 to 1.6 times larger. The same holds for an unknown attitude, which registration over relief does not correct.
 """
 
 ROCKY_FIELD_STEEPNESS = 0.32
@@ -151,7 +151,8 @@ class _Task:
     @property
     def far_m(self) -> float:
         """Length of a motion beyond which relief dominates its error [m]."""
-        return (FAR if self.frames.level == "linear" else FAR_CODED) * self.relief_m
+        known = not any(self.attitude.unsure)
+        return (FAR if known and self.frames.level == "linear" else FAR_CODED) * self.relief_m
 
     @cached_property
     def shadows(self) -> tuple[Floats, Floats] | None:
