@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 import mitsonar
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.image.direct import Direct
+from mitsonar.instruments.sounder import preset
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import MotionErrors, motion_errors
 from mitsonar.motion.pose import Pose, mounted
@@ -41,7 +42,8 @@ Array = NDArray[np.float64]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("bench/dives"), help="folder of the worlds")
-    parser.add_argument("--sonars", default=",".join(DIVE_SONARS))
+    one_ping = [name for name in DIVE_SONARS if preset(name).ping_groups == 1]  # groups need the frames of a whole dive
+    parser.add_argument("--sonars", default=",".join(one_ping))
     parser.add_argument("--flights", default=",".join(FLIGHTS))
     parser.add_argument("--worlds", type=int, default=12)
     parser.add_argument("--quick", action="store_true", help="two pairs of one sonar, kept nowhere: within a minute")
@@ -56,12 +58,12 @@ def main() -> None:
 
 def measure(out: Path, sonars: list[str], flights: list[str], worlds: int, places: int) -> None:
     """Print a row for each sonar, texture and flight."""
-    for preset in sonars:
+    for name in sonars:
         for flight in flights:
             for texture in TEXTURES:
-                result = errors_of(out, SETS[f"dive-{preset}-{flight}-3"], texture, worlds, places)
+                result = errors_of(out, SETS[f"dive-{name}-{flight}-3"], texture, worlds, places)
                 cells = (f"{triple(one)} | {one.nees:.2f}" for one in result)
-                print(f"| {preset} | {texture} | {flight} | {worlds * places} | {' | '.join(cells)} |", flush=True)
+                print(f"| {name} | {texture} | {flight} | {worlds * places} | {' | '.join(cells)} |", flush=True)
 
 
 def triple(errors: MotionErrors) -> str:
