@@ -209,7 +209,7 @@ def test_noise_of_sensors_widens_by_what_the_frames_leave_of_it(axis: int, chang
     std = np.tile(change / np.sqrt(2) * np.eye(3)[axis - 2], (2, 1))
     off = [poses + sign * change * np.outer([0, 1], np.eye(6)[axis]) for sign in (-1, 1)]
     moved_by, left = (
-        np.subtract(*(estimator.estimate(replace(frames, poses=one, attitude_std=noise)).motion for one in off)) / -2
+        np.diff([estimator.estimate(replace(frames, poses=one, attitude_std=noise)).motion for one in off], axis=0)[0] / 2
         for noise in (None, std)
     )
     plain, noisy = (estimator.estimate(replace(frames, attitude_std=one)).covariance for one in (None, std))
