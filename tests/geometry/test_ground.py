@@ -192,7 +192,7 @@ def test_heave_pitch_and_roll_look_like_motion_unless_they_are_unknown(axis: int
             * change
         )
         np.testing.assert_allclose(error, seen, atol=0.25 * np.abs(seen).max() + 2e-4)
-    assert corrected @ np.linalg.solve(unknown.covariance, corrected) < 6
+    assert corrected @ np.linalg.solve(unknown.covariance, corrected) < 2
     if axis != 3:
         assert error @ np.linalg.solve(wrong.covariance, error) > 5
         assert np.abs(corrected[:2]).max() < np.abs(error[:2]).max() / 2
@@ -230,11 +230,12 @@ def test_an_unknown_roll_turns_the_motion() -> None:
     level = poses * [1, 1, 1, 1, 0, 1]
     known, wrong = (estimator.estimate(replace(frames, poses=one)) for one in (poses, level))
     unknown = estimator.estimate(replace(frames, poses=level * [1, 1, np.nan, 1, 1, 1]))
-    error, corrected = (np.array(one.motion) - np.array(known.motion) for one in (wrong, unknown))
+    error = np.array(unknown.motion) - np.array(known.motion)
+    np.testing.assert_allclose(unknown.motion, wrong.motion, atol=1e-6)
     assert unknown.covariance is not None
     assert wrong.covariance is not None
     assert error @ np.linalg.solve(wrong.covariance, error) > 5
-    assert corrected @ np.linalg.solve(unknown.covariance, corrected) < 6
+    assert error @ np.linalg.solve(unknown.covariance, error) < 3
 
 
 def test_heave_looks_like_a_step_along_the_grazing_ray() -> None:

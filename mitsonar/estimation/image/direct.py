@@ -106,11 +106,12 @@ FARTHEST = np.array([0.15, 0.15, np.radians(3)])
 CLEARLY_FAR = 1.2
 """Motions this many times farther than :data:`FAR` count as far, whatever the finest level would show."""
 
-FAR, FAR_CODED, FAR_RAD = 0.02, 0.05, float(np.radians(1.5))
+FAR, FAR_CODED, FAR_RAD = 0.02, 0.03, float(np.radians(1.5))
 """Motions beyond this fraction of the height, or this turn, are far: relief dominates, and ``phase`` finds missed ones.
 
-In speckle, which also covers the ground between rocks, relief dominates later: up to 5 % of the height, errors over relief
-would be 1.3 to 1.6 times larger. The same holds for an unknown attitude, which registration over relief does not correct.
+In speckle, which also covers the ground between rocks, relief dominates later: at 2.5 % of the height, errors over relief
+would be 1.6 times larger. At 4 % the speckle has changed, and covariances over level ground would be too small. Where the
+attitude is unknown, motions are far later, too, since registration over relief does not correct it.
 """
 
 ROCKY_FIELD_STEEPNESS = 0.32

@@ -72,7 +72,7 @@ DISPLACEMENT_STD = 0.012
 """Standard deviation of displacements [bins, beams] that neither motion nor noise explains.
 
 Interpolation displaces frames by up to 0.02 bins where a pulse is shorter than a bin. With it, squared errors over the
-covariance are 0.7 to 1.4 over rocky fields, hulls and patterns, with and without speckle and noise; without, up to 3.7.
+covariance are 0.7 to 1.3 over rocky fields, over hulls without noise and over a pattern in speckle; without it, up to 3.7.
 """
 
 SURFACE_SLOPE_STD = float(np.radians(1))
@@ -363,14 +363,16 @@ def _fit(
     reduced = gradients[others] + of_others.T @ gradients[motion]
     trust, unexplained = _trust(schur[:-2, :-2], model * reduced @ reduced.T, linearisation)
     gain = of_others @ trust
-    left = np.sum([(derivative[others] * side.gradients).sum(axis=(1, 2)) for side in linearisation.sides], axis=0)
+    others_gradient = np.sum(
+        [(derivative[others] * side.gradients).sum(axis=(1, 2)) for side in linearisation.sides], axis=0
+    )
     # errors of the motion from the blocks, and from the prior where the frames hold no information
     changes = inverse @ gradients[motion] + gain @ reduced
     prior_part = inverse * (noise * prior_weight) @ inverse.T
     covariance = model * (changes @ changes.T) + (prior_part + prior_part.T) / 2 + gain @ unexplained @ gain.T
     # share of each block in the information
     shares = (np.tensordot(inverse, _information(cells.derivative, first.slopes), 1) * cells.derivative).sum(axis=(0, 1))
-    return -gain @ (left + of_others.T @ gradient), Fit(
+    return -gain @ (others_gradient + of_others.T @ gradient), Fit(
         converged=converged,
         covariance=covariance[:3, :3],
         by_unknown=(by_unknown - gain @ schur[:-2])[:3],
@@ -845,10 +847,8 @@ class GroundNodes:
 
         Returns:
             Ranges [m] and bearings [rad] per metre of height and per radian of pitch and of roll, then per radian of pitch
-            and of roll of both frames ``(5, 2, nodes, nodes)``; 0 if nothing is unknown.
+            and of roll of both frames ``(5, 2, nodes, nodes)``.
         """
-        if not any(self.attitude.unsure):
-            return np.zeros((5, *self.derivative.shape[1:]))
         row, column = self._source_nodes_of_frames[0]
         changes = []
         excess, both = (-0.5, 0.5), (1.0, 1.0)
