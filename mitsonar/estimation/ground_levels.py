@@ -11,11 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
+from scipy import ndimage, special
 
 from mitsonar.acoustics.levels import decoded
 from mitsonar.acoustics.statistics import decibels
@@ -69,14 +70,17 @@ ABSORPTION_STD = (0.3, 0.05)
 BEAM_GAIN_STD_DB = 2.0
 """Standard deviation of the prior of the beams' gains, if they are fitted."""
 
-BLOCKS, SAMPLES, MOST_VIEWS = (64, 32), 2, 16
-"""Largest number of blocks along range and of beams, places within a block where the model is computed, and poses."""
+BLOCKS, SAMPLES, MOST_VIEWS = (64, 32), (4, 8), 16
+"""Largest number of blocks along range and of beams, of places within a block where the model is computed, and of poses."""
+
+KEPT = 3 * MOST_VIEWS
+"""Number of geometries that a model remembers."""
 
 SAME_POSE = (0.01, math.radians(0.1))
 """Differences of height [m] and of angles [rad] within which frames are averaged."""
 
-MOST_CLIPPED, MOST_EMPTY = 0.005, 0.2
-"""Largest fractions of cells at full scale, and without a level, of a block that is used."""
+MOST_CLIPPED, CLIPPED_OVER, MOST_EMPTY = 0.1, 5, 0.2
+"""Largest fraction of cells at full scale, in a square of blocks, and of cells without a level, of a block that is used."""
 
 OUTLIER = 4.0
 """Robust standard deviations from the model beyond which a block is left out as an object or a shadow."""
@@ -109,24 +113,27 @@ class GroundModel:
 
     Args:
         sonar: the instrument, with its window, gain and patterns.
-        bearing_rad: bearings of the blocks ``(columns,)`` [rad].
+        bearing_rad: bearings of the blocks ``(columns,)``, or of places in them ``(columns, places)`` [rad].
         edges_m: ranges between the blocks ``(rows + 1,)`` [m].
     """
 
     def __init__(self, sonar: Sonar, bearing_rad: Array, edges_m: Array) -> None:
-        self.sonar, self.bearing_rad = sonar, bearing_rad
+        self.sonar, self.columns, self.bearing_rad = sonar, len(bearing_rad), bearing_rad.ravel()
         rows = len(edges_m) - 1
-        places = np.arange(rows * SAMPLES + 1) / SAMPLES
+        places = np.arange(rows * SAMPLES[0] + 1) / SAMPLES[0]
         self.edges_m = np.maximum(np.interp(places, np.arange(rows + 1), edges_m), 1e-6)
         self.range_m = (self.edges_m[1:] + self.edges_m[:-1]) / 2
         self.middle_m = float(np.sqrt(max(edges_m[0], sonar.bin_m) * edges_m[-1]))
         # gain of the instrument, and the width of a beam, which grows to the sides of the fan
         undone = np.interp(self.range_m, sonar.range_m, undone_absorption(sonar))
         self._gain = self.range_m ** (sonar.gain_exponent - 3.0) * undone
-        self._width = sonar.beam_width_rad / np.cos(bearing_rad) * sonar.bin_m / np.diff(self.edges_m)[:, None]
-        self.aside = np.square(np.sin(bearing_rad) / np.sin(np.abs(sonar.bearing_rad).max()))
+        self._width = sonar.beam_width_rad / np.cos(self.bearing_rad) * sonar.bin_m / np.diff(self.edges_m)[:, None]
+        aside = np.square(np.sin(self.bearing_rad) / np.sin(np.abs(sonar.bearing_rad).max()))
+        self.aside = aside.reshape(self.columns, -1).mean(axis=1)
         self._power = 4 if sonar.vertical_pattern == "two_way" else 2
         self._half = half_power((), self._power)
+        # most parameters leave the geometry as it is
+        self._cells, self._shape = (lru_cache(KEPT)(one) for one in (self._cells_of, self._shape_of))
 
     def levels(
         self,
@@ -149,23 +156,35 @@ class GroundModel:
             range_exponent: power of the range, relative to the middle of the window, besides that of ``gain_exponent``.
             least_pattern: least power of the pattern over elevation.
         """
+        shape = self._shape(height_m, pitch_deg, roll_deg, elevation_fov_deg, least_pattern)
+        # what depends on range alone; the sine of grazing is height over range
+        along = height_m * self._gain * (self.range_m / self.middle_m) ** range_exponent
+        along = along * np.exp(-2 * DB * absorption_db_per_m * self.range_m)
+        places = shape.shape[1] // self.columns
+        level = shape.reshape(-1, SAMPLES[0], self.columns * places) * along.reshape(-1, SAMPLES[0], 1)
+        return np.asarray(level.sum(axis=1).reshape(-1, self.columns, places).sum(axis=2) / (SAMPLES[0] * places))
+
+    def _cells_of(self, height_m: float, pitch_deg: float, roll_deg: float) -> tuple[Array, Array]:
+        """Compute elevation [rad] and solid angle [sr] of the ground in each cell, each ``(ranges, bearings)``."""
         geometry = GroundGeometry(
             self.edges_m, self.bearing_rad, self.sonar.bearing, height_m, math.radians(pitch_deg), math.radians(roll_deg)
         )
-        # 1. The solid angle of a cell lies between the elevations at which its two edges meet the ground.
+        # between the elevations at which the two edges of a cell meet the ground
         radius, bearing = np.meshgrid(self.edges_m, self.bearing_rad, indexing="ij")
         elevation = arc_elevation(self.sonar.bearing, bearing, -height_m / radius, geometry.turn[2])
         middle = (elevation[1:] + elevation[:-1]) / 2
         across = np.cos(middle) if self.sonar.bearing == "azimuth" else np.cos(self.bearing_rad)
-        solid_angle = np.abs(np.diff(elevation, axis=0)) * across * self._width
-        # 2. Pattern over elevation, and what depends on range alone; the sine of grazing is height over range.
-        x = np.sin(middle) * self._half / math.sin(math.radians(min(elevation_fov_deg, 179.0)) / 2)
-        along = height_m * self._gain * (self.range_m / self.middle_m) ** range_exponent
-        along = along * np.exp(-2 * DB * absorption_db_per_m * self.range_m)
-        pattern = np.where(np.abs(x) < 1, np.sinc(x) ** self._power, 0.0)
-        level = np.nan_to_num(solid_angle * np.maximum(pattern, least_pattern)) * along[:, None]
-        level = level.reshape(-1, SAMPLES, level.shape[1]).mean(axis=1)
-        return np.asarray(level)
+        return middle, np.abs(np.diff(elevation, axis=0)) * across * self._width
+
+    def _shape_of(
+        self, height_m: float, pitch_deg: float, roll_deg: float, elevation_fov_deg: float, least_pattern: float
+    ) -> Array:
+        """Compute the solid angle times the pattern over elevation [sr], 0 where the arc of a cell misses the ground."""
+        middle, solid_angle = self._cells(height_m, pitch_deg, roll_deg)
+        x = np.sin(middle) * (self._half / math.sin(math.radians(min(elevation_fov_deg, 179.0)) / 2))
+        square = np.square(np.where(np.abs(x) < 1, np.sinc(x), 0.0))
+        pattern = np.square(square) if self._power == 4 else square
+        return np.asarray(np.nan_to_num(solid_angle * np.maximum(pattern, least_pattern)))
 
 
 # ---------------- Frames as means of blocks
@@ -242,8 +261,12 @@ class GroundProblem:
 
         for k, number in enumerate(which):
             value = np.asarray(frames.image[number], dtype=float) / (255 if frames.image.dtype.kind == "u" else 1)
-            self.mean_of_frame[k] = averaged(decoded(value, sonar))
-            bad[:, k] = averaged(value >= FULL_SCALE) > MOST_CLIPPED, averaged(value <= 0) > MOST_EMPTY
+            # The mean of exponential intensities is that of the clipped ones over the share that is not clipped; of several
+            # looks, less is lost. The share is that of the neighbourhood, since leaving out or raising blocks for the chance
+            # clipping of their cells would bias the levels.
+            clipped = ndimage.uniform_filter(averaged(value >= FULL_SCALE), CLIPPED_OVER, mode="nearest")
+            self.mean_of_frame[k] = averaged(decoded(value, sonar)) / (1 - clipped / sonar.looks).clip(1e-3)
+            bad[:, k] = clipped > MOST_CLIPPED, averaged(value <= 0) > MOST_EMPTY
         edges = sonar.range_min + np.arange(rows + 1) * tall * sonar.bin_m
         far = edges[:-1] >= (fit.sonar.near_glow_m if fit.sonar.near_glow_db > 0 else 0.0)
         self.valid_of_frame = ~bad.any(axis=0) & far[:, None] & (self.mean_of_frame > 0)
@@ -262,7 +285,9 @@ class GroundProblem:
             )
         self._weight = (count / count.mean())[:, None, None]
         # 3. Model, priors and start.
-        bearing = averaged(np.broadcast_to(frames.bearing_rad, (bins, beams)))[0]
+        places = min(wide, SAMPLES[1])
+        beam = (np.arange(columns * places) + 0.5) * wide / places - 0.5
+        bearing = np.interp(beam, np.arange(beams), frames.bearing_rad).reshape(columns, places)
         self.model = GroundModel(sonar, bearing, edges)
         self.noise_gain = np.interp((edges[1:] + edges[:-1]) / 2, sonar.range_m, gain_of(sonar))[:, None]
         floor = np.where(self.valid, self.mean / self.noise_gain, np.inf)

@@ -15,7 +15,8 @@ from helpers import Array, Command, diffuse, floor, floor_levels, refused, scene
 from mitsonar.acoustics.water import gain_of
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.calibration import calibrate_sonar
-from mitsonar.estimation.ground_levels import GroundModel
+from mitsonar.estimation.ground_levels import GroundModel, GroundProblem, reference_of
+from mitsonar.estimation.sonar_fit import fit_sonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.records.frames import SonarFrames
@@ -115,6 +116,32 @@ def test_absorption_exponent_and_pattern_multiply_the_levels() -> None:
     whole = model.levels(1.0, 14.0, 0.0, 14.0, 0.0, 0.0, least_pattern=1.0)[:, 0]
     below = 1 / math.sin(math.radians(14 + 7))
     assert np.interp(below, middle, plain / whole) == pytest.approx(0.5, abs=0.01)
+
+
+def test_blocks_of_a_wide_fan_have_the_mean_level_of_their_beams() -> None:
+    wide = SHEET.replace(beams=128, azimuth_fov_deg=130)
+    edges, place = edges_of(wide)[::4], (2.0, 25.0, 0.0, 16.0, 0.3, 0.0)
+    beams = GroundModel(wide, wide.bearing_rad, edges).levels(*place).reshape(-1, 8, 16).mean(axis=2)
+    block = GroundModel(wide, wide.bearing_rad.reshape(8, 16), edges)
+    np.testing.assert_allclose(block.levels(*place), beams, rtol=1e-9)
+    # their middle is not enough: the edges of the pattern cross the blocks
+    middle = GroundModel(wide, wide.bearing_rad.reshape(8, 16).mean(axis=1), edges).levels(*place)
+    lit = beams > 0.1 * beams.max()
+    assert np.abs(10 * np.log10(middle[lit] / beams[lit])).max() > 0.1
+
+
+def test_clipped_cells_do_not_lower_the_levels() -> None:
+    """Of exponential intensities the mean is that of the clipped ones over the share that is not clipped."""
+    whole, other = drawn(PLACES, 2, 3), drawn(PLACES, 2, 4)
+    cut = replace(whole, image=np.minimum(6 * whole.image, 1), level_scale=whole.level_scale / 6)
+    whole_mean, mean, other_mean = (
+        problem.mean * frames.level_scale
+        for frames in (whole, cut, other)
+        for problem in [GroundProblem(frames, fit_sonar(frames).sonar, fit_sonar(frames), reference_of(frames))]
+    )
+    bright = other_mean > 0.5 * other_mean.max()  # independent of the speckle that is clipped
+    assert (cut.image >= 1).mean() > 3e-4
+    assert mean[bright].mean() == pytest.approx(whole_mean[bright].mean(), rel=5e-3)
 
 
 # ---------------- Known values come back
