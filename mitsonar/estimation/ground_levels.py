@@ -133,7 +133,8 @@ class GroundModel:
         self._power = 4 if sonar.vertical_pattern == "two_way" else 2
         self._half = half_power((), self._power)
         # most parameters leave the geometry as it is
-        self._cells, self._shape = (lru_cache(KEPT)(one) for one in (self._cells_of, self._shape_of))
+        self._cells = lru_cache(KEPT)(self._cells_of)
+        self._shape = lru_cache(KEPT)(self._shape_of)
 
     def levels(
         self,
