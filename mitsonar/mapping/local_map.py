@@ -515,7 +515,7 @@ def _images(source: FrameSource, numbers: Index) -> Iterator[tuple[SonarFrames, 
         frames = source.read(numbers[start : start + FRAMES_A_READ])
         values = frames.matching_values()
         for k in range(len(frames)):
-            yield frames.select(slice(k, k + 1)), patch_image(values[k])
+            yield frames.select(slice(k, k + 1)), patch_image(values[k], coded=frames.level != "linear")
 
 
 def _predicted(before: Array, estimate: Estimate, attitude: Array) -> Array:

@@ -26,6 +26,10 @@ REACH = (8, 3)
 SMOOTHING = (1.0, 0.6)
 """Standard deviations by which frames are smoothed [bins, beams]."""
 
+SMOOTHING_CODED = (0.6, 0.4)
+"""The same for frames with coded levels, which show speckle: it holds more of the motion than coarse content, whose shadows
+move over the ground. With :data:`SMOOTHING`, paths ahead over rocks became 2 to 3 % too long."""
+
 CELL = (26, 8)
 """Bins and beams of a grid cell in which one patch is chosen."""
 
@@ -96,9 +100,14 @@ class Alignment(NamedTuple):
     correlation: Array
 
 
-def patch_image(image: Floats) -> PatchImage:
-    """Prepare a frame ``(bins, beams)`` for :func:`corners`, :func:`cut` and :func:`align`."""
-    level = blurred(image, *SMOOTHING)
+def patch_image(image: Floats, coded: bool = False) -> PatchImage:
+    """Prepare a frame ``(bins, beams)`` for :func:`corners`, :func:`cut` and :func:`align`.
+
+    Args:
+        image: values for matching, of :meth:`mitsonar.records.frames.SonarFrames.matching_values`.
+        coded: whether the levels of the frame are coded, as those of speckle are.
+    """
+    level = blurred(image, *(SMOOTHING_CODED if coded else SMOOTHING))
     shadow = (level < SHADOW * cv2.blur(level, SHADOW_SURROUNDINGS)).astype(np.uint8)
     lit = 1 - cv2.dilate(shadow, np.ones(SHADOW_MARGIN[::-1], np.uint8)).astype(np.float32)
     return PatchImage(level, *central_differences(level), np.asarray(lit, dtype=np.float32))
