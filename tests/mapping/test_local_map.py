@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mitsonar.config.data import load_recipe
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
 from mitsonar.estimation.named import Zero
@@ -24,7 +26,11 @@ from mitsonar.mapping.sources import FrameSource
 from mitsonar.motion.composition import Motion, motions
 from mitsonar.motion.pose import Pose
 from mitsonar.motion.sensors import Readings, VehicleSensors
+from mitsonar.motion.trajectory import Trajectory
 from mitsonar.records.frames import SonarFrames
+from mitsonar.simulation.scene import load_scene
+from mitsonar.simulation.simulator import Simulator
+from mitsonar.worlds.families import RockyField
 
 FRAMES, STEP_M = 48, 0.02
 WRONG = np.array([0.0, 0.97, np.radians(0.03)])
@@ -103,6 +109,21 @@ def test_the_map_takes_out_what_pairs_of_frames_get_wrong() -> None:
     assert abs(error[0]) < 0.01 * length
     covariance = pose_covariances(series, start)[-1]
     assert 1e-4 < np.sqrt(covariance[0, 0]) < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.* lie outside the window")
+@pytest.mark.parametrize("seed", [7, 904])
+def test_a_path_ahead_over_speckled_rocks_is_as_long_as_it_is(seed: int, tmp_path: Path) -> None:
+    # with patches as smooth as those of still ground, and landmarks drawn to the ground, it was 3 % too long
+    world, parameters = RockyField(size_m=50).prepare(seed, tmp_path / "world")
+    coded = {"coding": "gamma", "coding_gamma": 0.5, "gain_exponent": 4}
+    sonar = load_recipe("rocky-field-physical").instrument.replace(model="coherent", quality="standard", **coded)
+    poses = np.zeros((120, 6))
+    poses[:, 1], poses[:, 2], poses[:, 3] = 0.0054 * np.arange(120) - 5.2, 2.5, np.radians(35)
+    frames = Simulator(load_scene(world, **parameters), sonar).render(Trajectory(poses, np.arange(120) / 21), seed=1)
+    path = odometry(frames, "direct", OdometryOptions(local_map=True)).path.poses
+    assert path[-1, 1] - path[0, 1] == pytest.approx(0.0054 * 119, rel=0.01)
 
 
 @pytest.mark.thorough
