@@ -174,7 +174,8 @@ def trained(arguments: argparse.Namespace, name: str, plan: Fields) -> None:
     from mitsonar.training.step import network_for
 
     accelerator = "gpu" if arguments.device == "cuda" else "cpu"
-    changes: Fields = {"precision": "bf16-mixed", "validate.every_minutes": 3, **(SMALL if arguments.small else {})}
+    precision = "bf16-mixed" if arguments.device == "cuda" else "32-true"
+    changes: Fields = {"precision": precision, "validate.every_minutes": 3, **(SMALL if arguments.small else {})}
     minutes, watch, out = plan["seconds"] / 60, Prints(), arguments.out / name
     batch = 8 if arguments.small else arguments.batch
     if plan["compiled"]:

@@ -52,7 +52,7 @@ def train(
     devices: Annotated[str, typer.Option(help="Lightning's devices: auto, a number, or a list (0,1).")] = "auto",
     strategy: Annotated[str, typer.Option(help="Lightning's strategy: auto, ddp ...")] = "auto",
     precision: Annotated[
-        str | None, typer.Option(help="Lightning's precision: 32-true, bf16-mixed ... (default: the recipe's).")
+        str | None, typer.Option(help="Lightning's precision: 32-true, or on a GPU bf16-mixed ... (default: the recipe's).")
     ] = None,
     threads: Annotated[int | None, typer.Option(help="Number of CPU threads (default: torch's choice).")] = None,
     workers: Annotated[

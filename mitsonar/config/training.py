@@ -201,7 +201,7 @@ class TrainingRecipe(_Part):
     batch: int = Field(4, ge=1, le=65_536, description="samples per step, over all devices")
     epochs: float | None = Field(32.0, gt=0, allow_inf_nan=False, description="passes over all samples; or steps")
     steps: int | None = Field(None, ge=1, description="steps of the optimiser, instead of epochs")
-    precision: Precision = Field("32-true", description="precision, as named by Lightning")
+    precision: Precision = Field("32-true", description="precision, as named by Lightning; on a processor only 32-true")
     validate_: Validate = Field(default_factory=Validate, alias="validate")
     seed: int = Field(0, ge=0, lt=2**31, description="seed for weights, order, noise and dropout")
 

@@ -48,7 +48,8 @@ def train(
         stop: called after each step; if it returns true, the state is saved and training stops.
 
     Raises:
-        MitsonarError: options contradict each other, which is checked before training begins, or the loss is not finite.
+        MitsonarError: options contradict each other, which is checked before training begins, or the loss or the weights
+            are not finite.
     """
     recipe, folder = options.changed_recipe(), RunFolder(Path(options.out), writes=is_main_process())
     earlier = folder.earlier_run() if options.resume else None
@@ -66,6 +67,11 @@ def train(
         _fit(journal, trainer, options)
     if journal.stopped:
         raise KeyboardInterrupt
+    if not folder.network.is_file():
+        raise MitsonarError(
+            f"the training in {folder.path} kept no network: its weights were not finite at any validation; set a lower "
+            "optimiser.rate, or optimiser.clip=1, and check the data with `mitsonar dataset check`"
+        )
     return Checkpoint.load(folder.path)
 
 
@@ -125,7 +131,8 @@ def _trainer(journal: Journal, options: TrainOptions) -> lightning.Trainer:
     """Create Lightning's trainer.
 
     Raises:
-        MitsonarError: Lightning rejects an argument, or a batch cannot be divided equally among the devices.
+        MitsonarError: Lightning rejects an argument, a processor would train in half precision, or a batch cannot be
+            divided equally among the devices.
     """
     module, folder = journal.module, journal.folder
     try:
@@ -152,12 +159,18 @@ def _trainer(journal: Journal, options: TrainOptions) -> lightning.Trainer:
             f"accelerator {options.accelerator}, devices {options.devices}, strategy {options.strategy}, precision "
             f"{module.recipe.precision} do not work here: {str(error).splitlines()[0]}"
         ) from None
+    on_cpu = trainer.strategy.root_device.type == "cpu"
+    if on_cpu and module.recipe.precision != "32-true":
+        raise MitsonarError(
+            f"precision {module.recipe.precision} needs a GPU: on processors with AMX, torch computes convolutions in "
+            "bfloat16 wrongly, and on others it is hardly faster; use 32-true"
+        )
     if module.recipe.batch % trainer.world_size:
         raise MitsonarError(
             f"a batch of {module.recipe.batch} cannot be shared by {trainer.world_size} devices: choose another batch, or "
             "--devices 1"
         )
-    if trainer.strategy.root_device.type == "cpu":
+    if on_cpu:
         torch.use_deterministic_algorithms(True)
         deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]  # saves a seventh of the time
     return trainer

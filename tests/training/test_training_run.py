@@ -654,6 +654,22 @@ def test_a_loss_that_is_not_finite_stops_and_says_where(tmp_path: Path) -> None:
     assert all(torch.isfinite(values).all() for values in state["state_dict"].values())
 
 
+def test_weights_that_are_not_finite_after_the_last_step_are_named(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loss was finite before it, so no step is at fault, and there is no network to keep."""
+    step = torch.optim.Adam.step
+
+    def spoilt(self: Any, closure: Any = None) -> Any:
+        loss = step(self, closure)
+        torch.nn.init.constant_(self.param_groups[0]["params"][0], np.nan)
+        return loss
+
+    monkeypatch.setattr(torch.optim.Adam, "step", spoilt)
+    with pytest.raises(MitsonarError, match=r"kept no network: its weights were not finite .* lower optimiser\.rate"):
+        train(TrainOptions(recipe(steps=1), made, tmp_path / "run", threads=1))
+
+
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
@@ -687,6 +703,7 @@ def test_words_that_do_not_go_together_are_refused(made: Path, tmp_path: Path) -
         ({"pairs": 3}, "--pairs must be at least the batch size"),
         ({"devices": 3, "accelerator": "cpu", "strategy": "ddp"}, "a batch of 8 cannot be shared by 3 devices"),
         ({"accelerator": "abacus"}, "do not work here"),
+        ({"accelerator": "cpu", "precision": "bf16-mixed"}, "precision bf16-mixed needs a GPU"),
         ({"resume": True, "overwrite": True}, "contradict each other"),
         ({"threads": 0}, "--threads must be at least 1"),
     ):
