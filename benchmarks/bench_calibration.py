@@ -2,7 +2,7 @@
 
     python benchmarks/bench_calibration.py [--draws 6] [--recordings FOLDER] [--json FILE]
 
-*simulated*: sonars whose taper, width over elevation, absorption and noise differ from their data sheets by chance, over
+*simulated*: sonars whose taper, width over elevation, absorption and crosstalk differ from their data sheets by chance, over
 level ground of one material, of patches, and with rocks. Eight coherent frames from different heights and pitches, whose
 poses err by a common height and pitch. Root mean square errors, their ratio to the stated standard deviations (1 is
 consistent), and what frames that were not fitted say: gain of the log likelihood of a block over the sonar of `sonar fit`.
@@ -27,6 +27,7 @@ from real_recordings import RECORDINGS, recordings_folder
 from mitsonar.acoustics.water import sonar_absorption
 from mitsonar.errors import MitsonarError, MitsonarWarning
 from mitsonar.estimation.calibration import Calibration, calibrate_sonar
+from mitsonar.instruments.sonar import crosstalk_amplitude
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.io.files import write_atomic
 from mitsonar.records.frames import SonarFrames
@@ -45,8 +46,11 @@ SONARS = {
 PLACES = ((1.5, 20), (1.5, 20), (2.0, 30), (2.0, 30), (2.6, 25), (2.6, 25), (1.8, 15), (1.8, 15))
 """Height [m] and pitch [deg] of each frame."""
 
-FIELDS = {"taper_db": 1.0, "elevation_fov_deg": 0.0, "height_m": 0.0, "pitch_deg": 1.0, "absorption_db_per_m": 0.0}
+FIELDS = {"taper_db": 1, "elevation_fov_deg": 0, "height_m": 0, "pitch_deg": 1, "absorption_db_per_m": 0, "crosstalk_db": 1}
 """Parameters: 1 for an error in their unit, 0 for a relative one."""
+
+LEAK_DB = (-25.0, -12.0)
+"""Power that leaks into the middle beam from all others, relative to theirs [dB]: the least and the most."""
 
 
 def main() -> None:
@@ -129,13 +133,15 @@ def simulated_row(name: str, ground_name: str, draws: int) -> list[str]:
             "elevation_fov_deg": sheet.elevation_fov_deg * float(rng.uniform(0.85, 1.15)),
             "absorption_db_per_m": sonar_absorption(sheet) * float(rng.uniform(0.7, 1.3)),
         }
+        leak = np.square(crosstalk_amplitude(sheet, 0.0)).sum(axis=0).max()
         off = np.array([0, 0, rng.normal(0, 0.1), math.radians(rng.normal(0, 1.5)), 0, 0])
         at = [
             [*rng.uniform(-10, 10, 2), height, math.radians(pitch), 0, rng.uniform(0, 2 * math.pi)]
             for height, pitch in PLACES
         ]
         poses = np.array(at)
-        frames = Simulator(scene, sheet.replace(**true)).render(poses)
+        true["crosstalk_db"] = float(rng.uniform(*LEAK_DB)) - 10 * math.log10(leak)
+        frames = Simulator(scene, sheet.replace(**true, seed=draw)).render(poses)
         frames = replace(frames, sonar=sheet, poses=poses + off)
         true |= {
             "height_m": float(np.median(poses[:, 2])),

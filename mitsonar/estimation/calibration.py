@@ -1,4 +1,4 @@
-"""How a sonar is calibrated with frames of level ground: taper, elevation pattern, absorption, noise, tilt and height."""
+"""How a sonar is calibrated with frames of level ground: taper, pattern, absorption, noise, crosstalk, tilt and height."""
 
 from __future__ import annotations
 
@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
-from mitsonar.estimation.ground_levels import FIELDS, INSTRUMENT, POSITIVE, GroundProblem, GroundSolution, reference_of
+from mitsonar.estimation.ground_levels import (
+    FIELDS,
+    INSTRUMENT,
+    NO_CROSSTALK_DB,
+    POSITIVE,
+    GroundProblem,
+    GroundSolution,
+    reference_of,
+)
 from mitsonar.estimation.sonar_fit import SonarFit, fit_sonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.records.frames import SonarFrames
@@ -21,6 +29,9 @@ Array = NDArray[np.float64]
 
 DETERMINED = 0.5
 """Ratio of the standard deviations after and before, above which the frames do not determine a parameter."""
+
+CERTAIN_LEAK_DB = 2.0
+"""Standard deviation [dB] above which crosstalk may as well be none, since a power is then not twice its own error."""
 
 TOGETHER = {
     "level_db": ": gain and reflectivity together",
@@ -53,7 +64,7 @@ class Calibration:
     Attributes:
         fit: the sonar with the fields that the frames determine, and what :func:`.fit_sonar` measures besides.
         parameters: by name, as in :data:`.FIELDS`.
-        covariance: of the parameters ``(9, 9)``, in their units; rows of given values are 0.
+        covariance: of the parameters ``(10, 10)``, in their units; rows of given values are 0.
         looks: effective number of independent looks of a block's mean.
         beam_gain_db: gain of each beam over the taper ``(beams,)`` [dB]; None unless requested.
         held_out: log likelihood per block, and rms error [dB], of this model and of ``sonar fit``, on frames that were
@@ -126,6 +137,8 @@ def calibrate_sonar(
         )
     known = {"height_m": height_m, "pitch_deg": pitch_deg, "roll_deg": roll_deg}
     known |= {name: given.get(name) for name in INSTRUMENT}
+    if "crosstalk_db" in given and given["crosstalk_db"] is None:
+        known["crosstalk_db"] = NO_CROSSTALK_DB
     if "gain_exponent" in given:
         known["range_exponent"] = 0.0
     fixed = {name: float(value) for name, value in known.items() if value is not None}
@@ -144,6 +157,8 @@ def calibrate_sonar(
         even, odd = (GroundProblem(half, sonar, fit, reference, each_beam=beam_gains) for half in halves)
         place = {name: value for name, value in fixed.items() if name not in INSTRUMENT}
         nominal = {name: problem.start[name] for name in INSTRUMENT}
+        if sonar.crosstalk_db is None:
+            nominal["crosstalk_db"] = NO_CROSSTALK_DB
         solutions = [
             even.solve(fixed, solution.values, beam_gains=beam_gains),
             even.solve(nominal | place, solution.values),
@@ -174,9 +189,10 @@ def _result(
     for k, (name, unit) in enumerate(FIELDS.items()):
         value = solution.values[name]
         prior = problem.prior_std[name] * (abs(value) if name in POSITIVE else 1.0)
-        determined = name not in fixed and bool(std[k] < DETERMINED * prior)
+        most = CERTAIN_LEAK_DB if name == "crosstalk_db" else DETERMINED * prior
+        determined = name not in fixed and bool(std[k] < most)
         parameters[name] = Calibrated(value, float(std[k]), unit, determined or name in fixed)
-        if name in fixed or determined:
+        if name in fixed or determined or name == "crosstalk_db":  # which has no effect where it is not determined
             continue
         correlation = solution.covariance[k] / np.maximum(std * std[k], 1e-300)
         correlation[[k, 0]] = 0.0
@@ -188,7 +204,7 @@ def _result(
         )
     # the sonar's fields, except those that only the prior determines
     fields: dict[str, Any] = {}
-    for name in ("taper_db", "elevation_fov_deg", "absorption_db_per_m", "noise_level_db"):
+    for name in ("taper_db", "elevation_fov_deg", "absorption_db_per_m", "noise_level_db", "crosstalk_db"):
         one = parameters[name]
         if name == "absorption_db_per_m" and fit.sonar.gain_absorption:
             continue  # the simulator's gain would undo it

@@ -1,9 +1,9 @@
 """How levels of frames over level ground are modelled, and the parameters of the model fitted to them.
 
-The mean level of a cell is C sin(grazing) dOmega R^(g - 2 + x) times losses and the pattern over elevation, plus noise,
-times the gain of its beam (:func:`mitsonar.acoustics.levels.level`). Means of blocks of cells follow a Gamma law, so the
-likelihood is maximised by Fisher scoring. Data sheets enter as normal priors. The covariance is the inverse of the Fisher
-information and the priors.
+The mean level of a cell is C sin(grazing) dOmega R^(g - 2 + x) times losses and the pattern over elevation, plus what leaks
+from other beams, plus noise, times the gain of its beam (:func:`mitsonar.acoustics.levels.level`). Means of blocks of cells
+follow a Gamma law, so the likelihood is maximised by Fisher scoring. Data sheets enter as normal priors. The covariance is
+the inverse of the Fisher information and the priors.
 """
 
 from __future__ import annotations
@@ -25,12 +25,13 @@ from mitsonar.errors import MitsonarError
 from mitsonar.estimation.sonar_fit import FULL_SCALE, SonarFit
 from mitsonar.geometry.ground import GroundGeometry, arc_elevation
 from mitsonar.instruments.beams import half_power
-from mitsonar.instruments.sonar import Sonar
+from mitsonar.instruments.sonar import Sonar, crosstalk_amplitude
 from mitsonar.records.frames import SonarFrames
 
 __all__ = [
     "FIELDS",
     "INSTRUMENT",
+    "NO_CROSSTALK_DB",
     "POSITIVE",
     "GroundModel",
     "GroundProblem",
@@ -42,11 +43,11 @@ Array = NDArray[np.float64]
 
 FIELDS = {
     "level_db": "dB", "height_m": "m", "pitch_deg": "deg", "roll_deg": "deg", "taper_db": "dB", "elevation_fov_deg": "deg",
-    "absorption_db_per_m": "dB/m", "range_exponent": "", "noise_level_db": "dB",
+    "absorption_db_per_m": "dB/m", "range_exponent": "", "noise_level_db": "dB", "crosstalk_db": "dB",
 }  # fmt: skip
 """Parameters and their units, in the order of their vector."""
 
-INSTRUMENT = ("taper_db", "elevation_fov_deg", "absorption_db_per_m", "range_exponent", "noise_level_db")
+INSTRUMENT = ("taper_db", "elevation_fov_deg", "absorption_db_per_m", "range_exponent", "noise_level_db", "crosstalk_db")
 """Parameters of the instrument rather than of the place."""
 
 POSITIVE = ("height_m", "elevation_fov_deg")
@@ -54,7 +55,7 @@ POSITIVE = ("height_m", "elevation_fov_deg")
 
 PRIOR_STD = {
     "level_db": 1e3, "height_m": 0.2, "pitch_deg": 5.0, "roll_deg": 3.0, "taper_db": 6.0, "elevation_fov_deg": 0.3,
-    "range_exponent": 1.5, "noise_level_db": 10.0,
+    "range_exponent": 1.5, "noise_level_db": 10.0, "crosstalk_db": 10.0,
 }  # fmt: skip
 """Standard deviations of the priors; of the logarithm where that is fitted."""
 
@@ -63,6 +64,10 @@ UNKNOWN_HEIGHT = 0.2
 
 UNKNOWN_POSE_STD = {"height_m": 1.0, "pitch_deg": 30.0}
 """The same for frames without poses."""
+
+FAINT_LEAK_DB, NO_CROSSTALK_DB = -20.0, -120.0
+"""Power that leaks into a beam from all others, relative to theirs, at which the prior of crosstalk has its middle where
+none was seen [dB]; and crosstalk without any effect."""
 
 ABSORPTION_STD = (0.3, 0.05)
 """Standard deviation of the prior of the absorption: as a fraction of it, and the least [dB/m]."""
@@ -211,7 +216,7 @@ class GroundSolution:
         fitted_gains: whether they were fitted.
         used: blocks that were used ``(views, rows, columns)``.
         looks: effective looks of a block.
-        covariance: of all parameters ``(9, 9)``, in their units.
+        covariance: of all parameters ``(10, 10)``, in their units.
     """
 
     values: dict[str, float]
@@ -297,12 +302,21 @@ class GroundProblem:
             noise_db = float(decibels(floor.min())) + fit.full_scale_db
         self.scale_db = fit.full_scale_db - sonar.source_level_db
         absorption = sonar_absorption(sonar)
+        # Power that a block receives from others by crosstalk of 0 dB (from, to), and its relative standard deviation: the
+        # gain of each pair of beams has a power of exponential law.
+        leak = np.square(crosstalk_amplitude(sonar, 0.0))[: columns * wide, : columns * wide]
+        self._leak = leak.reshape(columns, wide, columns, wide).sum(axis=1).mean(axis=2)
+        spread = np.sqrt(np.square(leak).sum(axis=0)) / np.maximum(leak.sum(axis=0), 1e-300)
+        self._leak_spread = np.sqrt(np.square(spread).reshape(columns, wide).mean(axis=1) / wide)
+        crosstalk_db = sonar.crosstalk_db
+        if crosstalk_db is None:
+            crosstalk_db = FAINT_LEAK_DB - 10 * math.log10(max(float(self._leak.sum(axis=0).max()), 1.0))
         self.start = {
             "level_db": 0.0, "height_m": float(np.nan_to_num(reference[0], nan=UNKNOWN_HEIGHT * edges[-1])),
             "pitch_deg": math.degrees(np.nan_to_num(reference[1])),
             "roll_deg": math.degrees(np.nan_to_num(reference[2])), "taper_db": sonar.taper_db,
             "elevation_fov_deg": sonar.elevation_fov_deg, "absorption_db_per_m": absorption, "range_exponent": 0.0,
-            "noise_level_db": noise_db,
+            "noise_level_db": noise_db, "crosstalk_db": crosstalk_db,
         }  # fmt: skip
         self.unknown = {n for n, known in zip(UNKNOWN_POSE_STD, reference, strict=False) if not math.isfinite(known)}
         self.prior_std = PRIOR_STD | {n: UNKNOWN_POSE_STD[n] for n in self.unknown}
@@ -311,15 +325,16 @@ class GroundProblem:
     # ---------------- Model
 
     def signal(self, values: dict[str, float], least_pattern: float = 0.0) -> Array:
-        """Return the mean levels of the ground ``(views, rows, columns)``, relative to full scale."""
-        names = [name for name in FIELDS if name not in ("level_db", "taper_db", "noise_level_db")]
+        """Return the mean levels of the ground ``(views, rows, columns)``, with crosstalk, relative to full scale."""
+        names = [name for name in FIELDS if name not in ("level_db", "taper_db", "noise_level_db", "crosstalk_db")]
         images = []
         for height, pitch, roll in self.away:
             one = {name: values[name] for name in names}
             one["height_m"] = max(one["height_m"] + height, 1e-3)
             one["pitch_deg"], one["roll_deg"] = one["pitch_deg"] + pitch, one["roll_deg"] + roll
             images.append(self.model.levels(**one, least_pattern=least_pattern))
-        return np.stack(images) * 10 ** ((values["level_db"] - self.scale_db) / 10)
+        signal = np.stack(images) * 10 ** ((values["level_db"] - self.scale_db) / 10)
+        return np.asarray(signal + signal @ (self._leak * 10 ** (values["crosstalk_db"] / 10)))
 
     def means(self, values: dict[str, float], gain_db: Array) -> tuple[Array, Array]:
         """Return the mean levels ``(views, rows, columns)``, and the fraction of them that is signal.
@@ -471,11 +486,21 @@ class GroundProblem:
             rise, best, values, gain_db = value - best, value, trial, gains
             if rise < 1e-6:
                 break
+        # The inverse of the information, and what the leak of each column differs from its mean over the draws of crosstalk.
+        inverse = np.linalg.inv(information)
+        mean, _ = self.means(values, gain_db)
+        none, _ = self.means(values | {"crosstalk_db": NO_CROSSTALK_DB}, gain_db)
+        odd = weight * (1 - none / mean) * self._leak_spread
+        odd_score = np.einsum("pvrc,vrc->pc", slope, odd)
+        if solution.fitted_gains:
+            odd_score -= cross / gain_information * (DB * odd.sum(axis=(0, 1)))
+        shift = inverse @ odd_score
+        inverse = inverse + shift @ shift.T
         # the covariance, in the parameters' units
         scale = np.array([values[n] if n in POSITIVE else 1.0 for n in free])
         index = [list(FIELDS).index(n) for n in free]
         covariance = np.zeros((len(FIELDS), len(FIELDS)))
-        covariance[np.ix_(index, index)] = np.linalg.inv(information) * scale[:, None] * scale
+        covariance[np.ix_(index, index)] = inverse * scale[:, None] * scale
         return replace(solution, values=values, gain_db=gain_db, covariance=covariance)
 
     # ---------------- Judgement

@@ -34,6 +34,7 @@ __all__ = [
     "Sonar",
     "TimedPath",
     "check_groups",
+    "crosstalk_amplitude",
     "first_sweeps",
     "frame_period_s",
     "group_of_beams",
@@ -192,6 +193,35 @@ def group_of_beams(sonar: Sonar) -> NDArray[np.int64]:
     if sonar.group_order == "sequential":
         return beam * sonar.ping_groups // sonar.beams
     return (beam if sonar.group_order == "interleaved" else beam[::-1]) % sonar.ping_groups
+
+
+CROSSTALK_FALL = 1 / 3
+"""Exponent by which the amplitude of crosstalk falls with the distance between channels. The kernel of a DIDSON, by which
+Teixeira et al. (2018, doi 10.1109/iros.2018.8594128) undo its crosstalk, is 1, 0.80, 0.68, 0.60 at distances 1 to 4."""
+
+
+def crosstalk_amplitude(sonar: Sonar, crosstalk_db: float, groups: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
+    """Return the rms amplitudes with which beams leak into each other ``(from, to)``.
+
+    They fall with the distance between the channels of a ping group. Over all pairs of a group, their mean square is
+    ``crosstalk_db``.
+
+    Args:
+        sonar: the instrument.
+        crosstalk_db: mean power of a pair [dB].
+        groups: ping group of each beam ``(beams,)``; default: those of the sonar.
+    """
+    groups = group_of_beams(sonar) if groups is None else groups
+    amplitude = np.zeros((sonar.beams, sonar.beams))
+    for group in np.unique(groups):
+        beams = np.flatnonzero(groups == group)
+        channel = np.arange(len(beams))
+        away = np.abs(channel[:, None] - channel)
+        fall = np.where(away > 0, np.maximum(away, 1.0) ** -CROSSTALK_FALL, 0)
+        if len(beams) > 1:
+            fall *= 10 ** (crosstalk_db / 20) / math.sqrt(np.square(fall).sum() / (len(beams) * (len(beams) - 1)))
+        amplitude[np.ix_(beams, beams)] = fall
+    return amplitude
 
 
 def ping_interval_s(sonar: Sonar) -> float:

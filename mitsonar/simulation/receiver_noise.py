@@ -20,7 +20,7 @@ from scipy.sparse import csr_array, diags_array
 from mitsonar.acoustics.noise import uniform
 from mitsonar.acoustics.water import loss_of
 from mitsonar.instruments.beams import series, shaded_sinc
-from mitsonar.instruments.sonar import Sonar, group_of_beams
+from mitsonar.instruments.sonar import Sonar, crosstalk_amplitude, group_of_beams
 from mitsonar.simulation.beams import PULSE_LENGTHS, BeamFormer
 
 __all__ = ["PROCESSES", "EchoTail", "ReceiverNoise", "crosstalk", "saturation_notes"]
@@ -31,10 +31,6 @@ Image = NDArray[np.complex64]
 STRIPES, NOISE, VOLUME, GLOW, CROSSTALK = 0x57121, 0x6E6F6973, 0x766F6C75, 0x676C6F77, 0x63726F73
 TAIL, DISTORTION, GROUPS, OFFSET = 0x7461696C, 0x636C6970, 0x67726F75, 0x6F666673
 """Salts of the seed that make the draws of the processes independent."""
-
-CROSSTALK_FALL = 1 / 3
-"""Exponent by which the amplitude of crosstalk falls with the distance between channels. The kernel of a DIDSON, by which
-Teixeira et al. (2018, doi 10.1109/iros.2018.8594128) undo its crosstalk, is 1, 0.80, 0.68, 0.60 at distances 1 to 4."""
 
 TAPS, TAP_SPREAD = 64, 0.5
 """Number of taps of a beam's tail, and the standard deviation of the logarithm of their amplitudes, beyond that of complex
@@ -328,8 +324,8 @@ class EchoTail:
 def crosstalk(sonar: Sonar, groups: NDArray[np.int64] | None = None) -> NDArray[np.complex64] | None:
     """Return the amplitudes with which beams leak into each other ``(from, to)``; None if they do not.
 
-    Each pair of beams of one ping group has a complex gain, drawn from the seed, that falls with the distance between their
-    channels. Over all pairs of a group, their mean square is ``crosstalk_db``.
+    Each pair of beams has a complex gain, drawn from the seed, whose mean square is that of
+    :func:`~mitsonar.instruments.sonar.crosstalk_amplitude`.
 
     Args:
         sonar: the instrument.
@@ -337,18 +333,9 @@ def crosstalk(sonar: Sonar, groups: NDArray[np.int64] | None = None) -> NDArray[
     """
     if sonar.crosstalk_db is None:
         return None
-    groups = group_of_beams(sonar) if groups is None else groups
     parts = np.random.default_rng([abs(sonar.seed), CROSSTALK]).normal(0, math.sqrt(0.5), (2, sonar.beams, sonar.beams))
-    gain = np.zeros((sonar.beams, sonar.beams), np.complex64)
-    for group in np.unique(groups):
-        beams = np.flatnonzero(groups == group)
-        channel = np.arange(len(beams))
-        away = np.abs(channel[:, None] - channel)
-        fall = np.where(away > 0, np.maximum(away, 1.0) ** -CROSSTALK_FALL, 0)
-        if len(beams) > 1:
-            fall *= 10 ** (sonar.crosstalk_db / 20) / math.sqrt(np.square(fall).sum() / (len(beams) * (len(beams) - 1)))
-        gain[np.ix_(beams, beams)] = fall * (parts[0] + 1j * parts[1])[np.ix_(beams, beams)]
-    return gain
+    gain = crosstalk_amplitude(sonar, sonar.crosstalk_db, groups) * (parts[0] + 1j * parts[1])
+    return np.asarray(gain, dtype=np.complex64)
 
 
 def _correlation(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

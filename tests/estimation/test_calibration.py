@@ -20,6 +20,7 @@ from mitsonar.estimation.sonar_fit import fit_sonar
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
 from mitsonar.records.frames import SonarFrames
+from mitsonar.simulation.receiver_noise import crosstalk
 
 ARIS = Path(__file__).resolve().parents[2].parent / "shared/data/real/aris1200-sdk-sample/sample.aris"
 
@@ -51,9 +52,13 @@ def edges_of(sonar: Sonar) -> Array:
     return np.asarray(sonar.range_min + np.arange(sonar.range_bins + 1) * sonar.bin_m, dtype=np.float64)
 
 
-def drawn(places: tuple[tuple[float, float], ...], count: int, seed: int, gain_db: Array | float = 0.0) -> SonarFrames:
+def drawn(
+    places: tuple[tuple[float, float], ...], count: int, seed: int, gain_db: Array | float = 0.0, sheet: Sonar = SHEET
+) -> SonarFrames:
     """Frames drawn from the law of the calibration itself: exponential intensities, independent from cell to cell."""
-    true = SHEET.replace(**TRUE, coding="linear")
+    true = sheet.replace(**TRUE, coding="linear")
+    gains = crosstalk(true)
+    leak = 0.0 if gains is None else np.abs(gains) ** 2
     model = GroundModel(true, true.bearing_rad, edges_of(true))
     noise = 10 ** (TRUE["noise_level_db"] / 10) * gain_of(true)[:, None]
     aside = np.square(np.sin(true.bearing_rad) / np.sin(true.bearing_rad[-1]))
@@ -61,11 +66,12 @@ def drawn(places: tuple[tuple[float, float], ...], count: int, seed: int, gain_d
     poses = poses_at(places, count)
     for pose in poses:
         echo = 0.3 * model.levels(pose[2], math.degrees(pose[3]), 0.0, 16.0, 0.5, 0.0)
+        echo = echo + np.dot(echo, leak)
         images.append((echo + noise) * 10 ** ((gain_db - 3.0 * aside) / 10))
     image = np.array(images)
     scale = 20 * float(image.max())
     image = image * draw.exponential(size=image.shape) / scale
-    plain = SHEET.replace(coding="linear")
+    plain = sheet.replace(coding="linear", crosstalk_db=None)
     return SonarFrames(
         image.astype(np.float32), plain.range_m, plain.bearing_rad, np.arange(len(image)) / 10.0, plain, level="linear",
         poses=poses, level_scale=scale,
@@ -194,6 +200,43 @@ def test_gains_of_beams_come_back() -> None:
     assert np.corrcoef(result.beam_gain_db, gain_db)[0, 1] > 0.95
     assert result.fit.sonar.stripes_db == pytest.approx(gain_db.std(), abs=0.2)
     assert calibrate_sonar(drawn(PLACES, 1, 5, gain_db)).beam_gain_db is None
+
+
+@pytest.mark.thorough
+def test_crosstalk_of_a_wide_fan_comes_back() -> None:
+    """Beams aside see the ground where the middle ones do not, so what leaks there looks like a wider pattern."""
+    sheet = SHEET.replace(beams=96, azimuth_fov_deg=130, crosstalk_db=-30.0)
+    frames = drawn(PLACES, 1, 21, sheet=sheet)
+    result = calibrate_sonar(frames)
+    leak = result.parameters["crosstalk_db"]
+    assert leak.determined
+    assert leak.value == pytest.approx(-30, abs=1.5)
+    assert result.fit.sonar.crosstalk_db == pytest.approx(leak.value, abs=0.01)
+    without = calibrate_sonar(frames, crosstalk_db=None)
+    assert without.parameters["crosstalk_db"].std == 0
+    assert result.held_out is not None
+    assert without.held_out is not None
+    assert result.held_out["calibrated"][0] > without.held_out["calibrated"][0]
+    errors = [
+        np.linalg.norm(
+            [
+                (one.parameters[name].value - true) / one.parameters[name].std
+                for name, true in (("elevation_fov_deg", 16.0), ("pitch_deg", 22.5), ("taper_db", 3.0))
+            ]
+        )
+        for one in (result, without)
+    ]
+    assert errors[0] < 4 < errors[1]
+
+
+@pytest.mark.thorough
+def test_crosstalk_that_level_ground_does_not_show_stays_unknown() -> None:
+    """In a narrow fan all beams see the same ground, so leaks look like a higher level."""
+    result = calibrate_sonar(drawn(PLACES, 1, 22, sheet=SHEET.replace(crosstalk_db=-40.0)))
+    assert not result.parameters["crosstalk_db"].determined
+    assert result.fit.sonar.crosstalk_db is None
+    assert any("crosstalk_db" in line and "not determined" in line for line in result.lines())
+    assert result.parameters["taper_db"].value == pytest.approx(3.0, abs=0.5)
 
 
 @pytest.mark.thorough
