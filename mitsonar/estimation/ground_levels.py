@@ -302,8 +302,8 @@ class GroundProblem:
             noise_db = float(decibels(floor.min())) + fit.full_scale_db
         self.scale_db = fit.full_scale_db - sonar.source_level_db
         absorption = sonar_absorption(sonar)
-        # Power that a block receives from others by crosstalk of 0 dB (from, to), and its relative standard deviation: the
-        # gain of each pair of beams has a power of exponential law.
+        # Power that a block receives from others by crosstalk of 0 dB (from, to), and its relative standard deviation over
+        # the draws of the gains of pairs, whose powers follow an exponential law.
         leak = np.square(crosstalk_amplitude(sonar, 0.0))[: columns * wide, : columns * wide]
         self._leak = leak.reshape(columns, wide, columns, wide).sum(axis=1).mean(axis=2)
         spread = np.sqrt(np.square(leak).sum(axis=0)) / np.maximum(leak.sum(axis=0), 1e-300)
@@ -486,7 +486,7 @@ class GroundProblem:
             rise, best, values, gain_db = value - best, value, trial, gains
             if rise < 1e-6:
                 break
-        # The inverse of the information, and what the leak of each column differs from its mean over the draws of crosstalk.
+        # The inverse of the information, widened because the gains of pairs are drawn: each column leaks more or less.
         inverse = np.linalg.inv(information)
         mean, _ = self.means(values, gain_db)
         none, _ = self.means(values | {"crosstalk_db": NO_CROSSTALK_DB}, gain_db)
