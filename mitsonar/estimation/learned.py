@@ -392,8 +392,8 @@ class Trained:
         trained_at = self._checkpoint.trained_at
         if frames.poses is not None:
             for name, column in (("pitch", 3), ("roll", 4)):
-                angle = math.degrees(frames.poses[:, column].mean())
-                if abs(angle - trained_at[f"{name}_deg"]) > ANGLE_OFF_DEG:
+                angle = math.degrees(np.unwrap(frames.poses[:, column]).mean())
+                if abs(math.remainder(angle - trained_at[f"{name}_deg"], 360)) > ANGLE_OFF_DEG:
                     return f"the sonar had a {name} of {angle:.1f} deg: {self._checkpoint.fixed} are fixed by training"
         return ""
 

@@ -746,7 +746,9 @@ def illumination(frames: SonarFrames, poses: ArrayLike | None = None, height_m: 
     over_ground = np.isfinite(heights)
     if not over_ground.any():
         raise MitsonarError(f"the illumination needs frames over ground, of known height: give {argument('height_m')}")
-    fan = fan_of(frames, table[over_ground].mean(axis=0), float(heights[over_ground].mean()))
+    shown = table[over_ground]
+    usual = np.concatenate([shown[:, :3], np.unwrap(shown[:, 3:], axis=0)], axis=1).mean(axis=0)
+    fan = fan_of(frames, usual, float(heights[over_ground].mean()))
     points = fan.ground.points
     lit = np.abs(fan.ground.elevation(points)) <= fan.half_elevation
     if not mean[lit].any():

@@ -337,6 +337,18 @@ def test_illumination_is_taken_out() -> None:
     assert results["with"][1] < 0.5 * results["without"][1]
 
 
+def test_illumination_of_a_sonar_mounted_upside_down() -> None:
+    """Its roll jumps between 180 and -180 deg, and the mean is 180 deg all the same."""
+    poses = [looking(0, x=0.12 * k, y=0.1 * k) for k in range(6)]
+    frames = frames_of(waves, poses)
+    assert frames.poses is not None
+    steady, jumping = frames.poses.copy(), frames.poses.copy()
+    steady[:, 4] = np.pi
+    jumping[:, 4] = (np.pi - 1e-3) * np.array([1, 1, -1, 1, 1, -1])
+    one, other = (illumination(frames, poses=table) for table in (steady, jumping))
+    np.testing.assert_allclose(other, one, rtol=0.02)
+
+
 # ---------------------------------------------------------------- runs, memory, bounds
 
 

@@ -58,7 +58,13 @@ def test_it_refuses_what_it_has_not_learnt(pairs: SonarPairs) -> None:
     higher, steeper = frames.poses.copy(), frames.poses.copy()
     higher[:, 2] += 1.0
     steeper[:, 3] += np.radians(5)
-    for changed in (replace(frames, poses=higher, height_m=frames.height_m + 1.0), replace(frames, poses=steeper)):
+    inverted = frames.poses.copy()
+    inverted[:, 4] = np.radians([179.9, -179.9])  # whose mean is not 0
+    for changed in (
+        replace(frames, poses=higher, height_m=frames.height_m + 1.0),
+        replace(frames, poses=steeper),
+        replace(frames, poses=inverted),
+    ):
         result = network.estimate(changed)
         assert not result.valid
         assert "height 2.5 m, pitch 35 deg are fixed by training" in result.reason
