@@ -41,6 +41,7 @@ __all__ = [
     "Steps",
     "StoredEchoes",
     "path_digest",
+    "path_to_render",
     "progress_of",
     "run",
     "write_run",
@@ -196,6 +197,23 @@ class RenderReport:
     warnings: list[str]
 
 
+def path_to_render(sonar: Sonar, trajectory: Trajectory, *, exr: bool = False) -> TimedPath:
+    """Return the poses and times of the pings of a run.
+
+    Args:
+        sonar: the instrument.
+        trajectory: poses and times.
+        exr: whether the echoes of each ray are to be stored.
+
+    Raises:
+        MitsonarError: the trajectory is too short for a sweep, or a frame whose echoes are to be stored is several pings.
+    """
+    timed = timed_path(sonar, trajectory)
+    if exr and timed.time_s.ndim > 1:
+        raise MitsonarError("echoes of each ray are stored only if a frame is one ping: leave out --exr or ping_groups")
+    return timed
+
+
 def run(source: Source, trajectory: Trajectory, options: RenderOptions, destination: Destination) -> RenderReport:
     """Render a trajectory into a run folder, or resume an interrupted run.
 
@@ -211,9 +229,7 @@ def run(source: Source, trajectory: Trajectory, options: RenderOptions, destinat
     Raises:
         MitsonarError: as in :func:`write_run`.
     """
-    timed = timed_path(source.sonar, trajectory)
-    if options.exr and timed.time_s.ndim > 1:
-        raise MitsonarError("echoes of each ray are stored only if a frame is one ping: leave out --exr or ping_groups")
+    timed = path_to_render(source.sonar, trajectory, exr=options.exr)
     settings = {
         "variant": source.variant,
         "sonar": source.sonar.model_dump(),

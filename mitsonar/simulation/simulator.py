@@ -214,11 +214,20 @@ class Simulator:
             gain: constant factor of the levels; default: set on the first 20 frames.
             label_floor: fraction of full scale above which a pixel is labelled; 0 labels every echo.
 
+        Raises:
+            MitsonarError: noise for a sonar that already includes it, or a first view of some of the beams.
+
         Warns:
             MitsonarWarning: nothing was hit; returns lie outside the window; pixels saturate; there are too few rays per
                 bin; a BSDF has no diffuse reflectance; the pings of frames overlap.
         """
         refuse_noise(noise, self.sonar)
+        first_view = self.views[0]
+        if len(first_view.bearing_rad) != self.sonar.beams:
+            raise MitsonarError(
+                f"frames hold all {self.sonar.beams} beams, but the first view, {first_view.name}, has "
+                f"{len(first_view.bearing_rad)}: put a view of all beams first, or use render_views"
+            )
         if not isinstance(trajectory, Trajectory):
             poses = np.atleast_2d(np.asarray(trajectory, dtype=float))
             trajectory = Trajectory(poses, np.arange(len(poses)) / self.sonar.frame_rate_hz)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsonar.acoustics.noise import NoiseModel, refuse_noise
 from mitsonar.errors import MitsonarError
 from mitsonar.instruments.hydrophones import ChannelSonar
-from mitsonar.instruments.sonar import Sonar, timed_path
+from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import Sounder, load_sonar, load_sounder, sonar_from
 from mitsonar.instruments.vehicle import SensorKeys, check_sensor_name, load_vehicle_recipe
 from mitsonar.motion.bodies import Moving, MovingBodies
@@ -28,6 +28,7 @@ from mitsonar.records.soundings import Echogram, Soundings
 from mitsonar.simulation.channel import ChannelSimulator
 from mitsonar.simulation.device import ensure_variant
 from mitsonar.simulation.moving import SceneMotion, SceneWatch, motion_in
+from mitsonar.simulation.runs import path_to_render
 from mitsonar.simulation.scene import MotionSpec, motions_of
 from mitsonar.simulation.simulator import Simulator
 from mitsonar.simulation.sounding import SounderSimulator
@@ -134,23 +135,26 @@ class VehicleSimulator:
         return np.stack(list(CameraSimulator(self.scene, instrument, moving=bodies).pictures(path.poses, path.time_s)))
 
 
-def refuse_path(sensors: Mapping[str, Mounted], vehicle: Trajectory, noise: NoiseModel | None = None) -> None:
+def refuse_path(
+    sensors: Mapping[str, Mounted], vehicle: Trajectory, noise: NoiseModel | None = None, *, exr: bool = False
+) -> None:
     """Refuse a trajectory that one of the sensors cannot follow, before any sensor is rendered.
 
     Args:
         sensors: sensors keyed by name.
         vehicle: trajectory of the vehicle.
         noise: noise model for imaging sonars.
+        exr: whether the echoes of each ray of imaging sonars are to be stored.
 
     Raises:
-        MitsonarError: the trajectory is too short for a sweep, or noise is given for a sonar that already includes noise;
-            the message names the sensor.
+        MitsonarError: the trajectory is too short for a sweep, noise is given for a sonar that already includes noise, or
+            a frame whose echoes are to be stored is several pings; the message names the sensor.
     """
     for name, one in sensors.items():
         if not isinstance(one.instrument, Sonar):
             continue
         try:
-            timed_path(one.instrument, vehicle)
+            path_to_render(one.instrument, vehicle, exr=exr)
             refuse_noise(noise, one.instrument)
         except MitsonarError as error:
             raise MitsonarError(f"sensor {name}: {error}") from None

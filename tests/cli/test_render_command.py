@@ -448,6 +448,9 @@ def test_all_sensors_of_a_scene_in_one_run(mitsonar: Command, tmp_path: Path) ->
     assert mitsonar(*arguments, "--resume").returncode == 0
     refused(mitsonar(*arguments), "kept as it is")
     refused(mitsonar(*arguments, "--sonar", "didson300", "--overwrite"), "--sonar names one sonar")
+    groups = (*arguments[:-1], tmp_path / "groups", "--set", "ping_groups=2", "--exr")
+    refused(mitsonar(*groups), "sensor sensor0: echoes of each ray are stored only if a frame is one ping")
+    assert not (tmp_path / "groups").exists()
 
 
 # ---------------------------------------------------------------- how fast, and how often

@@ -54,6 +54,15 @@ def test_segments_add_up_to_the_whole(model: str) -> None:
         assert 0.4 < cone.sum() / whole.sum() < 0.8  # a circle in a square holds 0.79 of it
 
 
+def test_frames_are_of_all_beams() -> None:
+    """A half has as many beams, a quadrant has not."""
+    sonar, pose = looking_down(model="physical", quality="draft"), mounted([[0, 0, 2.5, 0, 0, 0.4]], DOWN)
+    half, quadrant = (Simulator(scene(floor=floor()), sonar, views=[Segment(sonar, name)]) for name in ("port", "q1"))
+    assert half.render(pose).image.shape == (1, 64, 50)
+    with pytest.raises(MitsonarError, match=r"all 50 beams, but the first view, q1, has 25: .* use render_views"):
+        quadrant.render(pose)
+
+
 PLACES = [("q1", 1, 1), ("q2", 1, -1), ("q3", -1, -1), ("q4", -1, 1), ("c1", 1, 1), ("c3", -1, -1)]
 
 
