@@ -222,11 +222,11 @@ class Simulator:
                 bin; a BSDF has no diffuse reflectance; the pings of frames overlap.
         """
         refuse_noise(noise, self.sonar)
-        first_view = self.views[0]
-        if len(first_view.bearing_rad) != self.sonar.beams:
+        given = self._given[1]
+        if given and len(given[0].bearing_rad) != self.sonar.beams:
             raise MitsonarError(
-                f"frames hold all {self.sonar.beams} beams, but the first view, {first_view.name}, has "
-                f"{len(first_view.bearing_rad)}: put a view of all beams first, or use render_views"
+                f"frames hold all {self.sonar.beams} beams, but the first view, {given[0].name}, has "
+                f"{len(given[0].bearing_rad)}: put a view of all beams first, or use render_views"
             )
         if not isinstance(trajectory, Trajectory):
             poses = np.atleast_2d(np.asarray(trajectory, dtype=float))
