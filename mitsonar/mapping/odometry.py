@@ -379,12 +379,16 @@ class Odometry:
         lost = [estimate.reason for estimate in self.estimates if not estimate.valid]
         without = [one.about["map"] for one in self.estimates if one.about.get("map", USED) != USED]
         warnings = [self.doubt] if self.doubt else []
-        for reasons, what in ((lost, "were rejected and bridged"), (without, "are those of pairs of frames")):
+        outside_map = "; a map that is lost so often may drift more than pairs of frames: compare the path without it"
+        for reasons, what, advice in (
+            (lost, "were rejected and bridged", ""),
+            (without, "are those of pairs of frames", outside_map),
+        ):
             if len(reasons) > MANY * len(self.estimates):
                 part = 100 * len(reasons) / len(self.estimates)
                 warnings.append(
                     f"{len(reasons)} of {count_noun(len(self.estimates), 'motion')} ({part:.0f} %) {what}: "
-                    f"{_frequent(reasons)}"
+                    f"{_frequent(reasons)}{advice}"
                 )
         pauses_s = self.series.step_s[~self.valid]
         pauses_s = pauses_s[pauses_s > LONG_S]

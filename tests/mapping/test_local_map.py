@@ -196,3 +196,4 @@ def test_odometry_tells_what_the_map_did() -> None:
     dark[4:] = 0
     blind = odometry(replace(frames, image=dark), Zero(), options, store=known)
     assert "are those of pairs of frames" in blind.warnings()[0]
+    assert "compare the path without it" in blind.warnings()[0]
