@@ -44,7 +44,7 @@ def test_the_runner_tells_what_fails(
     assert run_quick.is_script(script)
     assert run_quick.passes(script, 60) is well
     output = capsys.readouterr().out
-    assert ("ok" in output, "FAILED" in output) == (well, not well)
+    assert output.split()[2] == ("ok" if well else "FAILED")  # the path of a clone may hold either word
     assert well or "no tracer" in output or "ZeroDivisionError" in output
 
 
