@@ -34,14 +34,14 @@ def main() -> None:
     if not arguments.quick:
         return compare_all(arguments.out, arguments.pairs, [arguments.only] if arguments.only else list(SETS), "none,high")
     with tempfile.TemporaryDirectory() as folder:
-        compare_all(Path(folder), 2, ["narrow"], "none")
+        compare_all(Path(folder), 2, ["narrow"], "none", world="size_m: 20, a_side: [8, 12]")
 
 
-def compare_all(out: Path, pairs: int, names: list[str], noise: str) -> None:
+def compare_all(out: Path, pairs: int, names: list[str], noise: str, world: str = "size_m: 30") -> None:
     """Make the data sets and compare the estimators on each."""
     out.mkdir(parents=True, exist_ok=True)
     scenes = min(4, pairs // 2)
-    fields = f"scenes=[{{count: {scenes}, sequences: {-(-pairs // scenes)}, world: {{size_m: 30}}}}]"
+    fields = f"scenes=[{{count: {scenes}, sequences: {-(-pairs // scenes)}, world: {{{world}}}}}]"
     for name in names:
         data = out / f"{name}.zarr"
         changes = [word for change in (fields, "flight.pings=2", *SETS[name]) for word in ("--set", change)]

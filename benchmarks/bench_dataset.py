@@ -73,8 +73,8 @@ FULL = Size(
 """5,000 and 25,000 frames, over 30 worlds each."""
 
 QUICK = Size(
-    crews=(("rocky-field", 1), ("rocky-field-physical", 2)),
-    sequences=(4, 20),
+    crews=(("rocky-field-physical", 2),),
+    sequences=(2, 10),
     changes=("scenes=[{count: 2, sequences: 20}]", "world={family: rocky-field, size_m: 20, a_side: [5, 9]}"),
     samples=40,
     buffer=10,

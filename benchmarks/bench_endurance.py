@@ -1,7 +1,7 @@
 """A long run: time and memory a frame, with a local map and a gyroscope; and runs that are killed and resumed.
 
     python benchmarks/bench_endurance.py [--frames 10000] [--killed 600] [--out DIR]
-    python benchmarks/bench_endurance.py --quick       # 24 frames of few rays, killed and resumed, kept nowhere
+    python benchmarks/bench_endurance.py --quick       # 12 frames of few rays, killed and resumed, kept nowhere
 
 450 frames of the run `forward` of `bench_trajectories.py` are rendered once. The sonar goes to and fro along them. All
 frames lie in a `frames.zarr`, as `mitsonar render` writes it. `mitsonar odometry --map --sensors` runs in a process of
@@ -72,13 +72,13 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=10_000, help="of the long run")
     parser.add_argument("--killed", type=int, default=600, help="frames of the runs that are killed")
     parser.add_argument("--out", type=Path, default=Path("out/endurance"), help="frames and runs")
-    parser.add_argument("--quick", action="store_true", help="24 frames of few rays: within a minute")
+    parser.add_argument("--quick", action="store_true", help="12 frames of few rays: within a minute")
     args = parser.parse_args()
     print(machine(0, 1).rsplit(";", 1)[0])
     if not args.quick:
         return benchmark(args.out, Scale(450, args.frames, args.killed))
     with tempfile.TemporaryDirectory(prefix="bench-endurance-") as folder:
-        benchmark(Path(folder), Scale(10, 24, 24, 2, coarse=True))
+        benchmark(Path(folder), Scale(6, 12, 12, 1, coarse=True))
 
 
 def benchmark(out: Path, scale: Scale) -> None:

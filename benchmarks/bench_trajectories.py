@@ -1,7 +1,7 @@
 """Table 2.1 and the synthetic trajectories of Almanza-Medina (2.3, 3.5.1), with estimators that need no training.
 
     python benchmarks/bench_trajectories.py [--only table21,trajectories] [--methods direct,posenet] [--frames N] [--every N]
-    python benchmarks/bench_trajectories.py --quick       # eight frames of each run, one seabed, kept nowhere
+    python benchmarks/bench_trajectories.py --quick       # five frames of each run, one seabed, kept nowhere
 
 `table21`: three runs over six seabeds (recipe pattern-runs), every consecutive pair, or one of N. `trajectories`: 904 frames
 over a rocky field that no recipe has, and two runs over the pattern; drift, and mosaics along true and estimated paths. Two
@@ -102,7 +102,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/trajectories"), help="data sets, results, estimates")
     parser.add_argument("--pictures", type=Path, help="where pictures go (default: OUT)")
     parser.add_argument("--every", type=int, default=1, help="of table21, only one of so many pairs")
-    parser.add_argument("--quick", action="store_true", help="eight frames of each run, one seabed: within a minute")
+    parser.add_argument("--quick", action="store_true", help="five frames of each run, one seabed: within a minute")
     args = parser.parse_args()
     parts = args.only.split(",")
     if not set(parts) <= set(PARTS):
@@ -110,7 +110,7 @@ def main() -> None:
     if not args.quick:
         return benchmark(args, parts, Table(TEXTURES, SETTINGS))
     with tempfile.TemporaryDirectory(prefix="bench-trajectories-") as folder:
-        few = {"frames": 8, "every": 1, "out": Path(folder), "pictures": None, "methods": "direct,posenet"}
+        few = {"frames": 5, "every": 1, "out": Path(folder), "pictures": None, "methods": "direct,posenet"}
         benchmark(argparse.Namespace(**{**vars(args), **few}), parts, Table(TEXTURES[:1], SETTINGS[:2]))
 
 

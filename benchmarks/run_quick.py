@@ -10,6 +10,7 @@ imported the libraries that most of them need; on Windows, which has no fork, ea
 from __future__ import annotations
 
 import argparse
+import gc
 import multiprocessing
 import os
 import runpy
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("benchmarks", "docs", "scenes")
-LIBRARIES = ["matplotlib.pyplot", "scipy.ndimage", "scipy.optimize", "torch", "zarr"]
+LIBRARIES = ["cv2", "lightning.pytorch", "matplotlib.pyplot", "scipy.stats", "torch", "zarr"]
 HAS_FORK = "forkserver" in multiprocessing.get_all_start_methods()
 PROCESSES: ForkServerContext | SpawnContext = (
     multiprocessing.get_context("forkserver") if HAS_FORK else multiprocessing.get_context("spawn")
@@ -104,6 +105,7 @@ def run_script(path: Path, output: Path) -> None:
     file = os.open(output, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     for stream in (1, 2):
         os.dup2(file, stream)
+    gc.freeze()  # what the libraries hold is left out of collections of garbage, of which each data set makes several
     os.chdir(path.parent)
     sys.argv, sys.path[0] = [str(path), "--quick"], str(path.parent)
     runpy.run_path(str(path), run_name="__main__")

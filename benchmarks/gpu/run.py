@@ -319,7 +319,7 @@ RENDERS = {
 def same(arguments: Request) -> Found:
     """Render scenes twice on the device, with equal bits, and once on the CPU, equal within `TOLERANCE_RMS`."""
     output, wrong = {}, []
-    for name in ("thesis", "scatterers") if arguments.small else RENDERS:
+    for name in ("thesis",) if arguments.small else RENDERS:
         first, second, cpu = (report(arguments, name, run) for run in ("first", "second", "cpu"))
         for key in sorted(first):
             if not np.array_equal(first[key], second[key], equal_nan=True):
@@ -493,8 +493,8 @@ STEPS: dict[str, Callable[[Request], Found]] = {
 }
 """In the order in which they are done."""
 
-IN_SMALL = {*STEPS} - {"flagships", *TABLE_52[1:]}
-"""Steps of a small scale; flagships.py has its own."""
+IN_SMALL = {*STEPS} - {"render_speed", "impulse_speed", "flagships", *TABLE_52[1:]}
+"""Steps of a small scale; the scripts that are left out know `--quick`."""
 
 
 if __name__ == "__main__":

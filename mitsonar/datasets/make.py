@@ -530,8 +530,9 @@ def make_shard(store: DataStore, shard: int) -> int:
 
 def forget() -> None:
     """Close the scene that :func:`make_shard` keeps loaded."""
-    _RENDERER.clear()
-    release_memory()
+    if _RENDERER:
+        _RENDERER.clear()
+        release_memory()
 
 
 def _shard_values(store: DataStore, shard: int) -> dict[str, Values]:
@@ -906,7 +907,8 @@ def refuse_worlds(recipe: Recipe) -> None:
                 f"mirrors: no shape of the worlds of scenes.{group} reflects: got {recipe.mirrors}; give [reflection, rms "
                 "height in m] by the ids of shapes, or shapes of materials that have both"
             )
-    release_memory()
+    if groups:
+        release_memory()
 
 
 def calibrate(recipe: Recipe) -> float:

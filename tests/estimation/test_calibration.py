@@ -284,7 +284,7 @@ def test_a_single_frame_holds_nothing_out() -> None:
     assert calibrate_sonar(drawn(PLACES[:1], 1, 9)).held_out is None
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.skipif(not ARIS.exists(), reason="needs the recordings of ../shared/data/real")
 def test_an_aris_over_a_bottom(mitsonar: Command, tmp_path: Path) -> None:
     done = mitsonar("sonar", "calibrate", ARIS, "-o", tmp_path / "aris.yaml")

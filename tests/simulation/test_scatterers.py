@@ -146,9 +146,9 @@ RECEIVER_HEADINGS_DEG = (
 
 SURFACES = {
     "425 points": (425.0, {}),
+    "cells of 29 mm": (1.0, {**CELLS, "cells": 414.0}),
     "1700 points": (1700.0, {}),
     "6800 points": (6800.0, {}),
-    "cells of 29 mm": (1.0, {**CELLS, "cells": 414.0}),
     "cells of 15 mm": (1.0, {**CELLS, "cells": 822.0}),
 }
 """Points a square metre, or a texture of cells, whose reflectivity is 0.5 in the mean, of a floor of 12 x 12 m."""
@@ -164,7 +164,7 @@ def incoherent(field: FieldOfView) -> float:
     return float((gain**2 * 0.5 * (HEIGHT / far) ** 2 / far**4).sum() * 0.004**2)
 
 
-@pytest.mark.parametrize("surface", essence(SURFACES))
+@pytest.mark.parametrize("surface", [*essence(list(SURFACES)[:2]), *essence(list(SURFACES)[2:], rest=pytest.mark.slow)])
 def test_a_level_floor_returns_the_incoherent_level_and_rayleigh_statistics(surface: str) -> None:
     """Whatever the density of points: within 0.3 dB, 600 poses, some 2,000 independent taps. Without phases of their own
     the points straight below return 0.7, 2.3 and 6.1 dB more, cells of 15 mm 3.6 dB more, and aside 1.7 dB less."""
