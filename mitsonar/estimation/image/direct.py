@@ -486,21 +486,9 @@ class _ReliefLevel:
         self.shape = self.images[0].shape
         self.block = max(1, RELIEF_BLOCK[0] // level.step), RELIEF_BLOCK[1]
         self.blocks = cell_blocks(self.shape, self.block)
-        self.sides = [self._derivatives(v, back=back) for back in (False, True)]
+        steps = np.array([*DERIVATIVE_STEPS[:3], DERIVATIVE_STEPS[3] * nodes.attitude.height_m])
+        self.sides = [self.cells.derivatives(v, steps, back=back) for back in (False, True)]  # (4, 2, bins, beams) each
         self.mean = self._mean(nodes.frames, nodes.attitude)
-
-    def _derivatives(self, v: NDArray[np.float64], *, back: bool) -> Floats:
-        """Return the derivatives of the displacement by motion and height ``(4, 2, bins, beams)``."""
-        derivatives = []
-        steps = *DERIVATIVE_STEPS[:3], DERIVATIVE_STEPS[3] * self.nodes.attitude.height_m
-        for k, small in enumerate(steps):
-            change = np.zeros(4)
-            change[k] = small
-            ahead, behind = (
-                self.cells.shift(v + sign * change[:3], back=back, lift_m=sign * float(change[3])) for sign in (1, -1)
-            )
-            derivatives.append((ahead - behind) / np.float32(2 * small))
-        return np.stack(derivatives)
 
     def _mean(self, frames: SonarFrames, attitude: Attitude) -> NDArray[np.float64]:
         """Return the prior mean of the heights ``(blocks,)`` [m]: level ground, as far as the fan illuminates it.

@@ -14,7 +14,7 @@ from scipy.interpolate import make_interp_spline
 
 from mitsonar.estimation.estimator import UNMEASURED, Excess, ambiguity, correlation_excess, correlation_of, spread_of
 from mitsonar.geometry.ground import Attitude, GroundGeometry, lit_margin, moved, nearest_known
-from mitsonar.motion.composition import Motion, inverse
+from mitsonar.motion.composition import inverse
 from mitsonar.records.frames import SonarFrames
 
 __all__ = [
@@ -617,7 +617,7 @@ class Cells:
         return np.asarray(cv2.erode(on_all, np.ones(reach, np.uint8)) if masked else on_all, dtype=np.float32)
 
     def _on_all(self, nodes: Doubles) -> Floats:
-        """Interpolate from the nodes to all cells ``(2, bins, beams)``, in bins and beams."""
+        """Interpolate from the nodes to all cells ``(..., 2, bins, beams)``, in bins and beams."""
         return np.asarray(self.grid.over_bins @ nodes.astype(np.float32) @ self.grid.over_beams)
 
     def _on_patches(self, nodes: Doubles) -> Doubles:
@@ -625,19 +625,53 @@ class Cells:
         middles = self.grid.over_rows @ nodes @ self.grid.over_columns
         return np.asarray(middles.reshape(*nodes.shape[:-2], -1))
 
-    def shift(self, v: Doubles, *, back: bool = False, lift_m: float = 0.0) -> Floats:
+    def shift(self, v: Doubles, *, back: bool = False) -> Floats:
         """Return the displacement of the ground of each cell ``(2, bins, beams)`` from the first frame to the second.
 
-        It is in bins and beams. ``back``: from the second frame to the first. ``lift_m``: for ground higher by this.
-        A translation moves shadows across the beams as far as the places where they begin.
+        It is in bins and beams. ``back``: from the second frame to the first. A translation moves shadows across the beams
+        as far as the places where they begin.
         """
-        nodes = self.nodes.shift(v, back=back, lift_m=lift_m)
+        nodes = self.nodes.shift(v, back=back, lift_m=0.0)
+        turning = 0.0 if self.casters is None else self.nodes.shift(np.array([0, 0, *v[2:]]), back=back, lift_m=0.0)
+        return self._with_shadows(nodes, nodes - turning, back)
+
+    def derivatives(self, v: Doubles, steps: Doubles, *, back: bool) -> Floats:
+        """Differentiate :meth:`shift` by motion and by the height of the ground, by central differences.
+
+        Args:
+            v: motion [m, rad] ``(3,)``.
+            steps: of sideways, forward [m], yaw [rad] and height [m] ``(4,)``.
+            back: from the second frame to the first.
+
+        Returns:
+            Bins and beams per metre and per radian ``(4, 2, bins, beams)``.
+        """
+        derivatives, turning = self._node_derivatives(v, steps, back), np.zeros(())
+        if self.casters is not None:
+            turning = self._node_derivatives(np.array([0, 0, v[2]]), np.array([0, 0, *steps[2:]]), back)
+        return self._with_shadows(derivatives, derivatives - turning, back)
+
+    def _node_derivatives(self, v: Doubles, steps: Doubles, back: bool) -> Doubles:
+        """Differentiate the displacement of the nodes ``(4, 2, nodes, nodes)``; 0 by what has a step of 0."""
+        moving = np.flatnonzero(steps[:3])
+        changes = np.diag(steps[:3])[moving]
+        derivatives = np.zeros((4, 2, *NODES))
+        ends = self.nodes.shift(v + np.stack([changes, -changes]), back=back, lift_m=0.0)
+        derivatives[moving] = (ends[0] - ends[1]) / (2 * steps[moving, None, None, None])
+        above, below = (self.nodes.shift(v, back=back, lift_m=sign * float(steps[3])) for sign in (1, -1))
+        derivatives[3] = (above - below) / (2 * steps[3])
+        return derivatives
+
+    def _with_shadows(self, nodes: Doubles, translation: Doubles, back: bool) -> Floats:
+        """Interpolate from the nodes to the cells ``(..., 2, bins, beams)``; a translation moves what casts a shadow.
+
+        What casts a shadow turns with it, so that only the translation counts.
+        """
         shift = self._on_all(nodes)
         if self.casters is not None:
-            # what casts a shadow turns with it, so that only the translation counts
-            across = (nodes - self.nodes.shift(np.array([0, 0, *v[2:]]), back=back, lift_m=lift_m))[1].astype(np.float32)
-            translation = self.grid.over_bins[1] @ across @ self.grid.over_beams[1]
-            shift[1] += translation.ravel()[self.casters[int(back)]] - translation
+            across = self.grid.over_bins[1] @ translation[..., 1, :, :].astype(np.float32) @ self.grid.over_beams[1]
+            casting = across.reshape(*across.shape[:-2], -1)[..., self.casters[int(back)]]
+            shift[..., 1, :, :] += casting - across
         return shift
 
     def leaning_shift_of_cells(self, v: Doubles) -> list[Floats]:
@@ -774,6 +808,7 @@ class GroundNodes:
 
     def __init__(self, frames: SonarFrames, attitude: Attitude, *, heave: bool) -> None:
         self.frames, self.attitude, self.heave = frames, attitude, heave
+        self._lifted: dict[float, tuple[GroundGeometry, GroundGeometry]] = {}
         self.axes = node_axes(frames.range_m, frames.bearing_rad)
         self.ground = self._ground(None)
         self.known = np.asarray(np.isfinite(self.ground.points).all(axis=-1), dtype=bool)
@@ -791,6 +826,13 @@ class GroundNodes:
     def _grounds_of_frames(self) -> tuple[GroundGeometry, GroundGeometry]:
         """Return the geometry of the nodes in each frame."""
         return (self._ground(0), self._ground(1)) if self.attitude.apart else (self.ground, self.ground)
+
+    def _lifted_grounds_of_frames(self, lift_m: float) -> tuple[GroundGeometry, GroundGeometry]:
+        """Return the geometry of the nodes in each frame over ground that is higher, and keep it: levels share it."""
+        if lift_m not in self._lifted:
+            one, other = (replace(ground, height_m=ground.height_m - lift_m) for ground in self._grounds_of_frames)
+            self._lifted[lift_m] = one, other
+        return self._lifted[lift_m]
 
     @cached_property
     def _source_nodes_of_frames(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
@@ -821,26 +863,31 @@ class GroundNodes:
         return tuple(self.frames.range_m.tolist()), tuple(self.frames.bearing_rad.tolist())
 
     def shift(self, v: Doubles, *, back: bool, lift_m: float) -> Doubles:
-        """Return the displacement of the nodes in range [m] and bearing [rad]; see :meth:`Cells.shift`."""
-        ground, other_ground = self._grounds_of_frames[:: -1 if back else 1]
-        if lift_m:
-            ground, other_ground = (replace(one, height_m=one.height_m - lift_m) for one in (ground, other_ground))
+        """Return the displacement of the nodes in range [m] and bearing [rad] ``(..., 2, nodes, nodes)``.
+
+        Args:
+            v: motions [m, rad] ``(..., 3)``, or one with heave [m] ``(4,)``.
+            back: from the second frame to the first, see :meth:`Cells.shift`.
+            lift_m: how much higher the ground is [m].
+        """
+        grounds = self._lifted_grounds_of_frames(lift_m) if lift_m else self._grounds_of_frames
+        ground, other_ground = grounds[:: -1 if back else 1]
         if self.heave:
             half = float(v[3]) / (2 if back else -2)
             ground, other_ground = (
                 replace(ground, height_m=ground.height_m + half),
                 replace(other_ground, height_m=other_ground.height_m - half),
             )
-        nodes = self._between(ground, other_ground, inverse(v[:3]) if back else v[:3])
+        nodes = self._between(ground, other_ground, inverse(v[..., :3]) if back else v[..., :3])
         # a cell that meets level ground may not meet ground that lies lower
         known = self._source_nodes_of_frames[int(back)]
         row, column = nearest_known(np.asarray(np.isfinite(nodes).all(axis=0), dtype=bool)) if lift_m else known
-        return np.asarray(nodes[:, row, column], dtype=np.float64)
+        return np.asarray(nodes[..., row, column], dtype=np.float64)
 
-    def _between(self, ground: GroundGeometry, other_ground: GroundGeometry, motion: Doubles | Motion) -> Doubles:
-        """Return the displacement of one frame's ground nodes in another ``(2, nodes, nodes)``; nan off the ground."""
-        radius, bearing = other_ground.to_polar(moved(ground.points, motion))
-        return np.stack([radius - self.axes[0][:, None], bearing - self.axes[1]])
+    def _between(self, ground: GroundGeometry, other_ground: GroundGeometry, motion: Doubles) -> Doubles:
+        """Return the displacement of one frame's ground nodes in another ``(..., 2, nodes, nodes)``; nan off the ground."""
+        radius, bearing = other_ground.to_polar(moved(ground.points, motion[..., None, None, :]))
+        return np.stack([radius - self.axes[0][:, None], bearing - self.axes[1]], axis=-3)
 
     def leaning_shift(self, v: Doubles) -> Doubles:
         """Return the derivative of :meth:`shift` by the excess of height, pitch and roll of the second frame.

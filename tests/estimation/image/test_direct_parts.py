@@ -71,6 +71,30 @@ def test_patches_move_as_their_cells_do(level: DirectLevel) -> None:
         assert np.abs(message - usable).max() < 0.05 * np.abs(usable).max()
 
 
+@pytest.mark.parametrize("shadowed", [False, True])
+@pytest.mark.parametrize("back", [False, True])
+def test_derivatives_are_differences_of_displacements(back: bool, shadowed: bool) -> None:
+    """By motion, and by the height of the ground: that of a sonar which flies lower by as much. Shadows move, too."""
+    v, steps = np.array([0.15, -0.1, 0.04]), np.array([2e-3, 2e-3, 5e-4, 0.1])
+    lengths = np.zeros((512, 96), np.float32)
+    lengths[300:340, 40:50] = np.arange(40)[:, None]
+    shadows = (lengths, lengths) if shadowed else None
+
+    def cells(lower_m: float = 0.0) -> Cells:
+        lower = replace(ATTITUDE, height_m=ATTITUDE.height_m - lower_m)
+        return Cells(GroundNodes(frames(), lower, heave=False), LEVELS[-1], shadows)
+
+    here = cells()
+    expected = [
+        (here.shift(v + change, back=back) - here.shift(v - change, back=back)) / (2 * small)
+        for small, change in zip(steps[:3], np.diag(steps[:3]), strict=True)
+    ]
+    expected.append((cells(steps[3]).shift(v, back=back) - cells(-steps[3]).shift(v, back=back)) / (2 * steps[3]))
+    rows = slice(max(cells(side).usable.start for side in (-steps[3], 0.0)), None)
+    for one, other in zip(here.derivatives(v, steps, back=back), expected, strict=True):
+        np.testing.assert_allclose(one[:, rows], other[:, rows], atol=2e-4 * np.abs(other[:, rows]).max())
+
+
 @pytest.mark.parametrize("level", LEVELS)
 def test_coarse_rows_are_those_of_the_smoothed_frame(level: DirectLevel) -> None:
     """Only some rows are computed, to the same values."""
