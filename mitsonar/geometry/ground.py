@@ -168,6 +168,35 @@ class GroundGeometry:
         return starboard, forward, up
 
 
+def lean_derivative(
+    ground: GroundGeometry, other_ground: GroundGeometry, motion: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Differentiate where the second sonar hears the ground points of the first, by height and attitude of both.
+
+    Args:
+        ground: of the first sonar.
+        other_ground: of the second.
+        motion: sideways, forward [m], yaw [rad] from the first to the second.
+
+    Returns:
+        Ranges [m] and bearings [rad] per metre of height and per radian of pitch and of roll by which the second sonar
+        exceeds the first, then per radian of pitch and of roll of both ``(5, 2, bins, beams)``; nan off the ground.
+    """
+    excess, both = (-0.5, 0.5), (1.0, 1.0)
+    names = ("height_m", excess), ("pitch_rad", excess), ("roll_rad", excess), ("pitch_rad", both), ("roll_rad", both)
+    changes = []
+    for name, parts in names:
+        ends = []
+        for sign in (-1, 1):
+            first, second = (
+                replace(one, **{name: getattr(one, name) + part * sign * SMALL})
+                for one, part in zip((ground, other_ground), parts, strict=True)
+            )
+            ends.append(np.stack(second.to_polar(moved(first.points, motion))))
+        changes.append((ends[1] - ends[0]) / (2 * SMALL))
+    return np.stack(changes)
+
+
 @lru_cache(maxsize=16)
 def _sonar_axes(pitch: float, roll: float) -> NDArray[np.float64]:
     """Return the axes of a sonar, cached since many geometries differ only in height."""
@@ -622,17 +651,23 @@ class Attitude:
         apart = self.apart[number] if self.apart else NOT_APART
         return self.height_m + apart.height_m - lift_m, self.pitch_rad + apart.pitch_rad, self.roll_rad + apart.roll_rad
 
-    def widened(self, covariance: NDArray[np.float64], frames: SonarFrames) -> NDArray[np.float64]:
+    def widened(
+        self, covariance: NDArray[np.float64], frames: SonarFrames, by_lean: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
         """Return the covariance of a motion ``(3, 3)``, enlarged for unknown heave, pitch and roll.
 
         Args:
             covariance: covariance of sideways, forward [m], yaw [rad], assuming equal height and attitude in both frames.
             frames: the two frames.
+            by_lean: change of the estimate per metre and radian of what :attr:`lean_std` describes ``(3, 5)``; default:
+                that of least squares over the lit ground for the changes, none for the means.
         """
-        std = np.array(self.unsure)
-        if not std.any():
+        if not self.lean_std.any():
             return covariance
-        apparent = self.ground(frames).motion_per_attitude(COARSE, np.radians(frames.sonar.elevation_fov_deg) / 2) * std
+        if by_lean is None:
+            half = np.radians(frames.sonar.elevation_fov_deg) / 2
+            by_lean = np.column_stack([self.ground(frames).motion_per_attitude(COARSE, half), np.zeros((3, 2))])
+        apparent = by_lean * self.lean_std
         return np.asarray(covariance + apparent @ apparent.T)
 
     def ground(self, frames: SonarFrames, number: int | None = None) -> GroundGeometry:

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import INPUTS, Estimate, two_frames
-from mitsonar.geometry.ground import GroundGeometry, attitude_of, moved
+from mitsonar.geometry.ground import GroundGeometry, attitude_of, lean_derivative, moved
 from mitsonar.instruments.sonar import Bearing
 from mitsonar.motion.composition import Motion, MotionPrior
 from mitsonar.records.frames import SonarFrames
@@ -161,6 +161,17 @@ class WindowGrid:
         map_there = np.stack(self._higher[1].to_polar(moved(self._higher_points, v)), axis=-1) - self.home
         return (np.nan_to_num(map_there - self.map(v)) / HEIGHT_STEP)[..., None]
 
+    def by_lean(self, v: Doubles) -> Doubles:
+        """Return the derivative of the map by height and attitude of both frames ``(n, m, 2, 5)``.
+
+        See :func:`~mitsonar.geometry.ground.lean_derivative`.
+        """
+        rows, columns = self.centres
+        first, second = (
+            replace(one, range_m=one.range_m[rows], bearing_rad=one.bearing_rad[columns]) for one in self._both_grounds
+        )
+        return np.moveaxis(np.nan_to_num(lean_derivative(first, second, v)), (1, 0), (2, 3))
+
 
 @lru_cache(maxsize=16)
 def window_grid(
@@ -205,10 +216,14 @@ fraction of the structure that lies twice as far from the axis in elevation as t
 
 
 class _Fit(NamedTuple):
-    """Motion, covariance, correlation of the matched frames, structure in each window, and whether the rounds settled."""
+    """Result of a level: correlation of the matched frames, structure in each window, whether the rounds settled.
+
+    For the others see :class:`MapMatch`.
+    """
 
     motion: Doubles
     covariance: Doubles | None
+    pull: Doubles
     correlation: float
     structure: Doubles
     converged: bool
@@ -274,7 +289,10 @@ class Flow:
         blocks = _blocks(fit.structure)
         reason = attitude.reason or _rejection(fit, blocks, unseen)
         about = {"correlation": float(fit.correlation), "blocks": blocks, "unseen": unseen, **attitude.about}
-        covariance = None if fit.covariance is None else attitude.widened(MODEL * fit.covariance, frames)
+        covariance = None
+        if fit.covariance is not None:
+            by_lean = np.einsum("inmd,nmdk->ik", fit.pull, grid.by_lean(v)) if attitude.lean_std.any() else None
+            covariance = attitude.widened(MODEL * fit.covariance, frames, by_lean)
         return Estimate(Motion(*(float(x) for x in v)), covariance, not reason, reason, about)
 
     def _register(self, first: Floats, second: Floats, grid: WindowGrid, start: Doubles, height_std: float) -> _Fit | None:
@@ -294,7 +312,7 @@ class Flow:
                 break
         assert match is not None
         correlation = _correlation(first, warped, inside, grid)
-        return _Fit(v, match.covariance, correlation, _structure(flow, grid), converged)
+        return _Fit(v, match.covariance, match.pull, correlation, _structure(flow, grid), converged)
 
 
 def _smoothed(image: Floats, level: FlowLevel) -> Floats:
@@ -455,10 +473,17 @@ class WindowFlow(NamedTuple):
 
 
 class MapMatch(NamedTuple):
-    """A motion and its covariance; the covariance is None where the match is not a maximum."""
+    """A motion that matches a displacement map.
+
+    Attributes:
+        motion: sideways, forward [m], yaw [rad] ``(3,)``.
+        covariance: its covariance ``(3, 3)``; None where the match is not a maximum.
+        pull: change of the motion per metre and radian of each window's displacement ``(3, n, m, 2)``.
+    """
 
     motion: Doubles
     covariance: Doubles | None
+    pull: Doubles
 
 
 def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float) -> MapMatch | None:
@@ -491,11 +516,13 @@ def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float)
         p = p + step
         if (np.abs(step[:3]) < STILL / 10).all():
             break
+    weighted = flow.information * weight[..., None, None] @ unknowns
+    pull = np.moveaxis(weighted @ np.linalg.inv(normal)[:, :3], -1, 0)
     # robust scores rise by the squared weight over both directions; only the shared slopes are free of either frame's noise
     normals = _normal(unknowns, flow.shared * (weight * weight)[..., None, None])
     if not _regular(normals.sum(axis=(0, 1)) + np.diag(prior)):
-        return MapMatch(p[:3], None)
-    return MapMatch(p[:3], _covariance(normals, scores, prior, height_std))
+        return MapMatch(p[:3], None, pull)
+    return MapMatch(p[:3], _covariance(normals, scores, prior, height_std), pull)
 
 
 def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | None:
@@ -526,7 +553,8 @@ def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | N
     # noise in the slopes shortens the flow by this factor
     gain = np.linalg.pinv(flow.information, hermitian=True) @ flow.shared
     normals = np.swapaxes(summary, -1, -2) @ gain @ grid.derivative
-    return MapMatch(v, _covariance(normals, scores, np.zeros(3), 0.0))
+    pull = np.moveaxis(summary @ np.linalg.inv(slope).T, -1, 0)
+    return MapMatch(v, _covariance(normals, scores, np.zeros(3), 0.0), pull)
 
 
 def _apply(unknowns: Doubles, gradient: Doubles) -> Doubles:

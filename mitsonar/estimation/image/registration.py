@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from mitsonar.estimation.estimator import UNMEASURED, Excess, ambiguity, correlation_excess, correlation_of, spread_of
-from mitsonar.geometry.ground import Attitude, GroundGeometry, lit_margin, moved, nearest_known
+from mitsonar.geometry.ground import Attitude, GroundGeometry, lean_derivative, lit_margin, moved, nearest_known
 from mitsonar.motion.composition import inverse
 from mitsonar.records.frames import SonarFrames
 
@@ -781,9 +781,6 @@ def _casting_cells(lengths: Floats, step: int) -> NDArray[np.intp]:
 NODES = (33, 17)
 """Nodes along range and bearing."""
 
-LEAN_STEP = 1e-4
-"""Step of height [m], pitch and roll [rad] of a frame for numerical derivatives."""
-
 HEIGHT_STEP = 0.05
 """Step of the height for numerical derivatives, as a fraction of it."""
 
@@ -897,19 +894,7 @@ class GroundNodes:
             and of roll of both frames ``(5, 2, nodes, nodes)``.
         """
         row, column = self._source_nodes_of_frames[0]
-        changes = []
-        excess, both = (-0.5, 0.5), (1.0, 1.0)
-        names = ("height_m", excess), ("pitch_rad", excess), ("roll_rad", excess), ("pitch_rad", both), ("roll_rad", both)
-        for name, parts in names:
-            ends = []
-            for sign in (-1, 1):
-                ground, other_ground = (
-                    replace(one, **{name: getattr(one, name) + part * sign * LEAN_STEP})
-                    for one, part in zip(self._grounds_of_frames, parts, strict=True)
-                )
-                ends.append(self._between(ground, other_ground, v[:3]))
-            changes.append((ends[1] - ends[0]) / (2 * LEAN_STEP))
-        return np.nan_to_num(np.stack(changes)[:, :, row, column])
+        return np.nan_to_num(lean_derivative(*self._grounds_of_frames, v[:3])[:, :, row, column])
 
     def unknown_shift(self, v: Doubles) -> Doubles:
         """Return the change of :meth:`shift` by one standard deviation of all that is uncertain.
