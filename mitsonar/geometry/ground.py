@@ -131,8 +131,8 @@ class GroundGeometry:
     def motion_per_attitude(self, along: int, half_rad: float) -> NDArray[np.float64]:
         """Compute the apparent motion caused by a change of height, pitch or roll between two pings.
 
-        It is the planar motion that best reproduces, in least squares, the changes of range (in bins) and bearing (in beams)
-        over the lit ground.
+        It is the planar motion that best reproduces the changes of range and bearing over the lit ground, in least squares
+        of metres: what the ground shows is as fine along a beam as across.
 
         Args:
             along: number of ranges and of bearings at which the ground is sampled.
@@ -143,20 +143,20 @@ class GroundGeometry:
             0 if the lit ground does not determine a motion.
         """
         # Sample a coarse grid of cells, and select those on lit ground.
-        bin_m, beam_rad = (float(np.median(np.abs(np.diff(axis)))) for axis in (self.range_m, self.bearing_rad))
         ranges, bearings = (np.linspace(axis[0], axis[-1], along) for axis in (self.range_m, self.bearing_rad))
         coarse = replace(self, range_m=ranges, bearing_rad=bearings)
         lit = np.isfinite(coarse.points).all(axis=-1) & (np.abs(coarse.elevation(coarse.points)) <= half_rad)
         if lit.sum() < 3:
             return np.zeros((3, 3))
-        # Express the derivatives in bins and beams, so that both have equal weight.
-        scale, points = np.array([bin_m, beam_rad]), coarse.points[lit]
-        by_motion = coarse.derivative[lit] / scale[:, None]
+        # Express the derivatives in metres along and across the beams.
+        points, across = coarse.points[lit], np.repeat(ranges[:, None], along, axis=1)[lit]
+        metres = np.stack([np.ones_like(across), across], axis=-1)
+        by_motion = coarse.derivative[lit] * metres[..., None]
         # Differentiate numerically with respect to height, pitch and roll, and fit the motion.
         changes = []
         for name in ("height_m", "pitch_rad", "roll_rad"):
             shifted = [replace(coarse, **{name: getattr(coarse, name) + sign * SMALL}).to_polar(points) for sign in (-1, 1)]
-            changes.append((np.stack(shifted[1], axis=-1) - np.stack(shifted[0], axis=-1)) / (2 * SMALL) / scale)
+            changes.append((np.stack(shifted[1], axis=-1) - np.stack(shifted[0], axis=-1)) / (2 * SMALL) * metres)
         motions = np.linalg.lstsq(by_motion.reshape(-1, 3), np.stack(changes, axis=-1).reshape(-1, 3), rcond=None)[0]
         return np.asarray(motions)
 

@@ -223,7 +223,7 @@ class _Fit(NamedTuple):
 
     motion: Doubles
     covariance: Doubles | None
-    pull: Doubles
+    by_window: Doubles
     correlation: float
     structure: Doubles
     converged: bool
@@ -291,7 +291,7 @@ class Flow:
         about = {"correlation": float(fit.correlation), "blocks": blocks, "unseen": unseen, **attitude.about}
         covariance = None
         if fit.covariance is not None:
-            by_lean = np.einsum("inmd,nmdk->ik", fit.pull, grid.by_lean(v)) if attitude.lean_std.any() else None
+            by_lean = np.einsum("inmd,nmdk->ik", fit.by_window, grid.by_lean(v)) if attitude.lean_std.any() else None
             covariance = attitude.widened(MODEL * fit.covariance, frames, by_lean)
         return Estimate(Motion(*(float(x) for x in v)), covariance, not reason, reason, about)
 
@@ -312,7 +312,7 @@ class Flow:
                 break
         assert match is not None
         correlation = _correlation(first, warped, inside, grid)
-        return _Fit(v, match.covariance, match.pull, correlation, _structure(flow, grid), converged)
+        return _Fit(v, match.covariance, match.by_window, correlation, _structure(flow, grid), converged)
 
 
 def _smoothed(image: Floats, level: FlowLevel) -> Floats:
@@ -478,12 +478,12 @@ class MapMatch(NamedTuple):
     Attributes:
         motion: sideways, forward [m], yaw [rad] ``(3,)``.
         covariance: its covariance ``(3, 3)``; None where the match is not a maximum.
-        pull: change of the motion per metre and radian of each window's displacement ``(3, n, m, 2)``.
+        by_window: change of the motion per metre and radian of each window's displacement ``(3, n, m, 2)``.
     """
 
     motion: Doubles
     covariance: Doubles | None
-    pull: Doubles
+    by_window: Doubles
 
 
 def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float) -> MapMatch | None:
@@ -517,12 +517,12 @@ def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float)
         if (np.abs(step[:3]) < STILL / 10).all():
             break
     weighted = flow.information * weight[..., None, None] @ unknowns
-    pull = np.moveaxis(weighted @ np.linalg.inv(normal)[:, :3], -1, 0)
+    by_window = np.moveaxis(weighted @ np.linalg.inv(normal)[:, :3], -1, 0)
     # robust scores rise by the squared weight over both directions; only the shared slopes are free of either frame's noise
     normals = _normal(unknowns, flow.shared * (weight * weight)[..., None, None])
     if not _regular(normals.sum(axis=(0, 1)) + np.diag(prior)):
-        return MapMatch(p[:3], None, pull)
-    return MapMatch(p[:3], _covariance(normals, scores, prior, height_std), pull)
+        return MapMatch(p[:3], None, by_window)
+    return MapMatch(p[:3], _covariance(normals, scores, prior, height_std), by_window)
 
 
 def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | None:
@@ -553,8 +553,8 @@ def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | N
     # noise in the slopes shortens the flow by this factor
     gain = np.linalg.pinv(flow.information, hermitian=True) @ flow.shared
     normals = np.swapaxes(summary, -1, -2) @ gain @ grid.derivative
-    pull = np.moveaxis(summary @ np.linalg.inv(slope).T, -1, 0)
-    return MapMatch(v, _covariance(normals, scores, np.zeros(3), 0.0), pull)
+    by_window = np.moveaxis(summary @ np.linalg.inv(slope).T, -1, 0)
+    return MapMatch(v, _covariance(normals, scores, np.zeros(3), 0.0), by_window)
 
 
 def _apply(unknowns: Doubles, gradient: Doubles) -> Doubles:

@@ -124,6 +124,9 @@ def test_a_roll_that_no_sensor_tells_is_in_the_covariance() -> None:
     turned = np.array(unknown.motion) - known.motion
     assert abs(turned[0]) > 5e-3
     assert 0.8 < turned @ np.linalg.solve(unknown.covariance - known.covariance, turned) < 1.2
+    level = GroundGeometry(frames.range_m, frames.bearing_rad, "azimuth", 2.5, START.pitch)
+    of_networks = level.motion_per_attitude(12, np.radians(7))[:, 2] * roll_rad  # which have no windows
+    np.testing.assert_allclose(of_networks[[0, 2]], turned[[0, 2]], rtol=0.4)
 
 
 def test_height_is_a_further_unknown() -> None:
