@@ -638,7 +638,7 @@ def compare(
     notes = notes if scenes < FEWEST_SCENES else []
     notes += [
         f"{name} was trained on {count} of the {count_noun(len(bench.numbers), 'pair')}, whose errors are too small; "
-        f"give {argument('part')} {bench.first.split.unseen}, or other data"
+        f"take the part {bench.first.split.unseen}, or other data"
         for name, count in bench.learnt.items()
         if count
     ]
