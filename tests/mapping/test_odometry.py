@@ -673,6 +673,14 @@ def run(
     return {name: content for name, content in files.items() if name not in ("run.json", "path.png")}
 
 
+def test_motions_keep_the_times_of_a_clock(tmp_path: Path) -> None:
+    """Seconds since 1970, as recordings count them, keep their fractions."""
+    path = Trajectory(sway(4).poses, 1764424800.125 + 0.25 * np.arange(4))
+    run(tmp_path / "out", path)
+    rows = csv.DictReader((tmp_path / "out/motions.csv").open())
+    assert [float(row["time_s"]) for row in rows] == path.time_s[1:].tolist()
+
+
 def test_a_folder_holds_the_path_and_all_about_it(tmp_path: Path) -> None:
     path = sway(20)
     out = tmp_path / "out"
