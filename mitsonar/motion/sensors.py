@@ -734,7 +734,8 @@ def _column(table: CsvTable, name: str, *, complete: bool = False) -> Array:
     for row, (cells, number) in enumerate(zip(table.rows, numbers, strict=True), start=2):
         cell = cells[column].strip()
         if (cell or complete) and not (abs(number) <= LARGEST and "_" not in cell):
-            raise MitsonarError(f"{table.path}, row {row:,}: {name} must be a number: got {cell[:40]!r}")
+            limit = f"; numbers up to {LARGEST:g} are read, times in s" if LARGEST < abs(number) < np.inf else ""
+            raise MitsonarError(f"{table.path}, row {row:,}: {name} must be a number: got {cell[:40]!r}{limit}")
     return numbers
 
 
