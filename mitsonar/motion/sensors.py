@@ -112,7 +112,7 @@ class Readings:
         if not (np.diff(self.time_s) > 0).all():
             where = int(np.flatnonzero(~(np.diff(self.time_s) > 0))[0])
             raise MitsonarError(
-                f"times of readings must increase: got {self.time_s[where + 1]:g} s after {self.time_s[where]:g}"
+                f"times of readings must increase: got {self.time_s[where + 1]:.15g} s after {self.time_s[where]:.15g}"
             )
         if not (self.std >= MIN_STD).all():
             raise MitsonarError(f"standard deviations of readings must be above 0: got {self.std.min():g}")

@@ -394,8 +394,8 @@ def _refuse_other_convention(path: str | Path, line: str, convention: Convention
 def _refuse_disorder(path: str | Path, number: int, rows: list[list[float]]) -> None:
     if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
         raise MitsonarError(
-            f"trajectory {path}, line {number}: time must increase, got {rows[-1][0]:g} s after {rows[-2][0]:g} s; sort the "
-            "lines"
+            f"trajectory {path}, line {number}: time must increase, got {rows[-1][0]:.15g} s after {rows[-2][0]:.15g} s; "
+            "sort the lines, and leave out repeated times"
         )
 
 

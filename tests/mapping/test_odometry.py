@@ -580,6 +580,8 @@ def test_a_planar_path_takes_the_frames_pitch_and_another_keeps_its_own() -> Non
     np.testing.assert_array_equal(source.along(Trajectory(local, path.time_s))[1], local)
     with pytest.raises(MitsonarError, match=r"no pose is within 0.01 s of a frame: give the path of this run"):
         source.along(Trajectory(path.poses, path.time_s + 100))
+    with pytest.raises(MitsonarError, match=r"lasts from 1764424800 to 1764424800.9 s, "):
+        source.along(Trajectory(path.poses, 1764424800 + 0.1 * np.arange(10)))
     # the path's own where sensors miss a frame
     lean = np.full((10, 3), 0.4)
     lean[3] = np.nan

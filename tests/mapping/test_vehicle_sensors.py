@@ -366,6 +366,7 @@ def test_readings_that_are_none_are_refused() -> None:
         ({"values": np.zeros(2)}, "a time, a value"),
         ({"values": np.array([0, np.nan, 0])}, "finite"),
         ({"time_s": np.zeros(3)}, "increase"),
+        ({"time_s": 1764424800.5 - time}, "got 1764424799.5 s after 1764424800.5"),
         ({"std": np.zeros(3)}, "above 0"),
     ):
         with pytest.raises(MitsonarError, match=message):

@@ -230,6 +230,11 @@ def test_hydrophones_may_go_where_they_like_but_not_upside_down(tmp_path: Path) 
         ("mitsonar", "time,x,y,z,qx,qy,qz,qw\n17644248000000000,1,2,3,0,0,0,1\n", r"up to 1e\+12 \(times in s\)"),
         ("mitsonar", "time,x,y,z,qx,qy,qz,qw\n0,1,2\n", "line 2: expected finite numbers"),
         ("mitsonar", "time,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n0,1,2,3,0,0,0,1\n", "line 3: time must increase"),
+        (
+            "mitsonar",
+            "time,x,y,z,qx,qy,qz,qw\n1764424800.5,1,2,3,0,0,0,1\n1764424800.25,1,2,3,0,0,0,1\n",
+            "got 1764424800.25 s after 1764424800.5 s; sort the lines",
+        ),
         ("ros-enu", "time,x,y,z,roll_deg,pitch_deg,heading_deg\n0,1,2,3,0,0,0\n", r"has a heading, which turns clockwise"),
         ("ros", "time,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n", r"unknown frame 'ros' of poses: did you mean ros-enu\?"),
     ],
