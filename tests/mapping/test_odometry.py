@@ -624,6 +624,9 @@ def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
     (tmp_path / "with two" / "b.aris").write_bytes(aris_file())
     write_xtf(tmp_path / "with two" / "c.xtf", side_scan_echogram())
     (tmp_path / "with two" / "notes.txt").write_text("none")
+    (tmp_path / "vehicle" / "ahead").mkdir(parents=True)
+    numbered(sway(4)).save(tmp_path / "vehicle" / "ahead" / "frames.npz")
+    write_xtf(tmp_path / "vehicle" / "c.xtf", side_scan_echogram())
     (tmp_path / "wrong.npz").write_bytes(b"no zip")
     (tmp_path / "empty.aris").touch()
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
@@ -634,6 +637,7 @@ def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
         ("empty", r"holds no frames\.npz or frames\.zarr: give frames\.npz"),
         ("with one", r"holds no frames\.npz or frames\.zarr: give the recording in it, .*with one.a\.aris"),
         ("with two", r"holds no frames\.npz or frames\.zarr: give one of the recordings in it: b\.aris, c\.xtf$"),
+        ("vehicle", r"give one of the recordings in it: ahead, c\.xtf$"),
         ("none.aris", r"no such file: .*none\.aris; give frames\.npz, .* or a recording"),
         ("wrong.npz", r"cannot read frames .*: it is neither a whole frames\.npz nor a recording .*: ARIS \(\.aris\), "),
         ("empty.aris", r"cannot read frames .*empty\.aris: it is empty; give .* a recording: ARIS \(\.aris\), "),
