@@ -149,6 +149,8 @@ SIMILAR = 0.7
 
 def missing_file(path: str | Path, otherwise: str = "") -> MitsonarError:
     """Return an error that suggests the file with the most similar name in the folder; ``otherwise`` if there is none."""
+    if os.path.islink(path):
+        return MitsonarError(f"no such file: {path} is a link to {os.readlink(path)}, which is missing; mend or replace it")
     try:
         names = {name.lower(): name for name in sorted(os.listdir(Path(path).parent))}
     except OSError:
