@@ -200,7 +200,8 @@ def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) 
             full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO)
             typer.echo(f"error: {error.strerror or error}{where}{_resume_hint(command) if full else ''}", err=True)
         except MemoryError:
-            typer.echo("error: out of memory; ask for less: beams, rays or bins of the sonar, objects of a world", err=True)
+            less = "frames or pings, beams, rays or bins of the sonar, objects of a world"
+            typer.echo(f"error: out of memory; ask for less: {less}", err=True)
         except RuntimeError as error:
             if "memory" not in str(error):
                 raise

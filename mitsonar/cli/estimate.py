@@ -319,11 +319,12 @@ def mosaic(
         save_figure(out, mosaic_figure(ground_map, paths, title=f"{name}, along the {laid_along} path"))
         save_figure(quality, quality_figure(ground_map, title=name))
     rows, columns = ground_map.mean.shape
-    spread = float(np.nanmedian(ground_map.std)) if np.isfinite(ground_map.std).any() else float("nan")
+    known = ground_map.std[np.isfinite(ground_map.std)]
+    spread = f"median standard deviation {np.median(known):.4f}" if known.size else "no cell is lit by two frames"
     say(
         f"{count_noun(ground_map.frames, 'frame')} along the {laid_along} path: {rows:,} x {columns:,} cells of "
         f"{cell_mm:g} mm, {rows * cell_mm / 1e3:.4g} x {columns * cell_mm / 1e3:.4g} m; "
-        f"median standard deviation {spread:.4f}"
+        f"{spread}"
     )
     say(f"mosaic: {out}" + (f", quality: {quality}" if quality else " (bands: mean, standard deviation, count)"))
 

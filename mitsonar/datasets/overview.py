@@ -186,7 +186,7 @@ def _summary(axes: NDArray[np.object_], store: DataStore, name: str, view: str) 
         columns, names = [store.read("pose")[:, 2]], ["height (m)"]
     for column, axis in enumerate(axes[1:]):
         if column < len(columns):
-            axis.hist(columns[column], bins=40, color="0.4")
+            axis.hist(np.round(columns[column], 6), bins=40, color="0.4")  # equal but for rounding in one sequence
             axis.set(xlabel=names[column], ylabel="frames")
         else:
             axis.axis("off")
@@ -272,7 +272,7 @@ def _response_summary(axes: NDArray[np.object_], store: DataStore, names: list[s
     motion = motion[~np.isnan(motion).any(axis=1)]
     axes[1].plot(*(1e3 * motion[:, :2].T), ".", ms=2)
     axes[1].set(xlabel="sideways (mm a ping)", ylabel="forward (mm a ping)", aspect="equal")
-    axes[2].hist(np.degrees(motion[:, 2]), bins=40, color="0.4")
+    axes[2].hist(np.round(np.degrees(motion[:, 2]), 6), bins=40, color="0.4")
     axes[2].set(xlabel="yaw (deg a ping)", ylabel="pings")
 
 

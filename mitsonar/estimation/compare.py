@@ -638,7 +638,7 @@ def compare(
     notes = notes if scenes < FEWEST_SCENES else []
     notes += [
         f"{name} was trained on {count} of the {count_noun(len(bench.numbers), 'pair')}, whose errors are too small; "
-        f"give {argument('part')} {bench.first.split.unseen}, or other data"
+        f"take the part {bench.first.split.unseen}, or other data"
         for name, count in bench.learnt.items()
         if count
     ]
@@ -684,7 +684,11 @@ def _bench(data: str, estimators: Estimators, options: ComparisonOptions) -> Ben
     samples = {level: samples_of(modality, data, noise=level, **chosen_samples) for level in levels}
     first = next(iter(samples.values()))
     if len(first) < 2:
-        raise MitsonarError(f"a comparison needs two pairs or more: give {argument('part')} all, or a larger data set")
+        part = chosen_samples["part"]
+        raise MitsonarError(
+            f"a comparison needs two pairs or more, of a made data set one a sequence: got {len(first)} in the part {part}; "
+            f"give {'' if part == 'all' else argument('part') + ' all, or '}a larger data set"
+        )
     if options.jitter and first.recipe.instrument.jittered:
         raise MitsonarError(f"the rays of this data set already move: {jitter} is for Almanza-Medina's model")
     numbers = chosen(len(first), options.pairs, options.seed)

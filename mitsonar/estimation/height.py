@@ -339,7 +339,7 @@ def heights_csv(time_s: Array, estimates: list[HeightEstimate], true: Array | No
     for k, one in enumerate(estimates):
         numbers = [f"{value:.6g}" if np.isfinite(value) else "" for value in (one.height_m, one.std_m)]
         z = "" if true is None else f"{true[k]:.6g}"
-        table.writerow([k, f"{time_s[k]:.9g}", *numbers, int(one.valid), one.reason, z])
+        table.writerow([k, f"{time_s[k]:.9f}", *numbers, int(one.valid), one.reason, z])
     return text.getvalue()
 
 

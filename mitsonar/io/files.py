@@ -149,6 +149,8 @@ SIMILAR = 0.7
 
 def missing_file(path: str | Path, otherwise: str = "") -> MitsonarError:
     """Return an error that suggests the file with the most similar name in the folder; ``otherwise`` if there is none."""
+    if os.path.islink(path):
+        return MitsonarError(f"no such file: {path} is a link to {os.readlink(path)}, which is missing; mend or replace it")
     try:
         names = {name.lower(): name for name in sorted(os.listdir(Path(path).parent))}
     except OSError:
@@ -453,6 +455,16 @@ def finite_number(value: Any, name: str, above: float = -math.inf, below: float 
     return float(value)
 
 
+def _refuse_repeated_keys(node: yaml.MappingNode, source: str) -> None:
+    """Refuse a key that a mapping holds twice, which YAML forbids and of which PyYAML takes the last."""
+    seen = set()
+    for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+        if (key.tag, key.value) in seen:
+            line = key.start_mark.line + 1
+            raise MitsonarError(f"{source}, line {line}: the key {short_repr(key.value)} occurs twice; leave one out")
+        seen.add((key.tag, key.value))
+
+
 def _check_nodes(node: yaml.Node, source: str) -> None:
     """Check the depth and size of a YAML document before its values are constructed, counting aliases in full."""
     pending, count = [(node, 0)], 0
@@ -465,6 +477,7 @@ def _check_nodes(node: yaml.Node, source: str) -> None:
                 f"more than {MAX_YAML_VALUES:,} values"
             )
         if isinstance(item, yaml.MappingNode):
+            _refuse_repeated_keys(item, source)
             pending += [(inner, depth + 1) for pair in item.value for inner in pair]
         elif isinstance(item, yaml.SequenceNode):
             pending += [(inner, depth + 1) for inner in item.value]

@@ -142,7 +142,7 @@ def _navigated(responses: ImpulseResponses, navigation: Trajectory | None) -> Im
     begin, end = (float(navigation.time_s[k]) for k in (0, -1))
     if begin > first + 1e-6 or end < last - 1e-6:
         raise MitsonarError(
-            f"the navigation must cover the pings, {first:.6g} to {last:.6g} s: got {begin:.6g} to {end:.6g} s"
+            f"the navigation must cover the pings, {first:.15g} to {last:.15g} s: got {begin:.15g} to {end:.15g} s"
         )
     flown = Trajectory(navigation.at(responses.time_s), responses.time_s)
     return replace(responses, poses=flown.poses, velocity=velocities(flown))

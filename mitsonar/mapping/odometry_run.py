@@ -251,7 +251,7 @@ def _motions_csv(result: Odometry) -> str:
     for k, estimate in enumerate(result.estimates):
         deviations = ["", "", ""] if std is None else [f"{value:.6g}" for value in std[k]]
         numbers = [f"{value:.6f}" for value in moved[k]]
-        frames = [int(result.frames[k]), int(result.frames[k + 1]), f"{result.series.time_s[k + 1]:.9g}"]
+        frames = [int(result.frames[k]), int(result.frames[k + 1]), f"{result.series.time_s[k + 1]:.9f}"]
         table.writerow([*frames, *numbers, *deviations, int(estimate.valid), estimate.reason])
     return text.getvalue()
 

@@ -330,7 +330,7 @@ class FrameSource:
         bad = np.flatnonzero(~(np.diff(self.time_s) > 0))
         if not np.isfinite(self.time_s).all() or bad.size:
             where = int(bad[0]) if bad.size else 0
-            times = ", ".join(f"{time:g}" for time in self.time_s[where : where + 2])
+            times = ", ".join(f"{time:.15g}" for time in self.time_s[where : where + 2])
             raise MitsonarError(
                 f"{self.name}: frame times must be finite and increase: got {times} s at frame {where}; write the frames in "
                 "order, with time_s"
@@ -414,8 +414,9 @@ class FrameSource:
             there, index = associated(path.time_s, self.time_s, tolerance_s)
         except MitsonarError:
             raise MitsonarError(
-                f"the path lasts from {path.time_s[0]:g} to {path.time_s[-1]:g} s, {self.name} from {self.time_s[0]:g} to "
-                f"{self.time_s[-1]:g} s, and no pose is within {tolerance_s:g} s of a frame: give the path of this run"
+                f"the path lasts from {path.time_s[0]:.15g} to {path.time_s[-1]:.15g} s, {self.name} from "
+                f"{self.time_s[0]:.15g} to {self.time_s[-1]:.15g} s, and no pose is within {tolerance_s:g} s of a frame: "
+                "give the path of this run"
             ) from None
         poses = path.poses[there].copy()
         attitudes = self.attitudes(index)

@@ -112,7 +112,7 @@ class Readings:
         if not (np.diff(self.time_s) > 0).all():
             where = int(np.flatnonzero(~(np.diff(self.time_s) > 0))[0])
             raise MitsonarError(
-                f"times of readings must increase: got {self.time_s[where + 1]:g} s after {self.time_s[where]:g}"
+                f"times of readings must increase: got {self.time_s[where + 1]:.15g} s after {self.time_s[where]:.15g}"
             )
         if not (self.std >= MIN_STD).all():
             raise MitsonarError(f"standard deviations of readings must be above 0: got {self.std.min():g}")
@@ -734,7 +734,8 @@ def _column(table: CsvTable, name: str, *, complete: bool = False) -> Array:
     for row, (cells, number) in enumerate(zip(table.rows, numbers, strict=True), start=2):
         cell = cells[column].strip()
         if (cell or complete) and not (abs(number) <= LARGEST and "_" not in cell):
-            raise MitsonarError(f"{table.path}, row {row:,}: {name} must be a number: got {cell[:40]!r}")
+            limit = f"; numbers up to {LARGEST:g} are read, times in s" if LARGEST < abs(number) < np.inf else ""
+            raise MitsonarError(f"{table.path}, row {row:,}: {name} must be a number: got {cell[:40]!r}{limit}")
     return numbers
 
 

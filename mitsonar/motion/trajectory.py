@@ -394,8 +394,8 @@ def _refuse_other_convention(path: str | Path, line: str, convention: Convention
 def _refuse_disorder(path: str | Path, number: int, rows: list[list[float]]) -> None:
     if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
         raise MitsonarError(
-            f"trajectory {path}, line {number}: time must increase, got {rows[-1][0]:g} s after {rows[-2][0]:g} s; sort the "
-            "lines"
+            f"trajectory {path}, line {number}: time must increase, got {rows[-1][0]:.15g} s after {rows[-2][0]:.15g} s; "
+            "sort the lines, and leave out repeated times"
         )
 
 
@@ -407,8 +407,8 @@ def _tum_row(path: str | Path, number: int, line: str) -> list[float]:
         row = []
     if len(row) != 8 or not (np.abs(row) <= FARTHEST).all() or not np.linalg.norm(row[4:]) >= 1e-6:
         raise MitsonarError(
-            f"trajectory {path}, line {number}: expected `time x y z qx qy qz qw` as finite numbers with a "
-            f"quaternion other than zero, got {line.strip()[:60]!r}"
+            f"trajectory {path}, line {number}: expected `time x y z qx qy qz qw` as finite numbers up to "
+            f"{FARTHEST:g} (times in s) with a quaternion other than zero, got {line.strip()[:60]!r}"
         )
     return row
 
@@ -474,8 +474,8 @@ def _csv_row(path: str | Path, number: int, words: list[str], columns: list[int]
     zero = len(columns) == 8 and bool(row) and not np.linalg.norm(row[4:]) >= 1e-6
     if not row or not (np.abs(row) <= FARTHEST).all() or zero:
         raise MitsonarError(
-            f"trajectory {path}, line {number}: expected finite numbers in the columns that its first line names, and no "
-            f"quaternion of zero, got {','.join(words)[:60]!r}"
+            f"trajectory {path}, line {number}: expected finite numbers up to {FARTHEST:g} (times in s) in the columns that "
+            f"its first line names, and no quaternion of zero, got {','.join(words)[:60]!r}"
         )
     return row
 

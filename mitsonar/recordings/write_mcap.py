@@ -629,8 +629,13 @@ def nanoseconds(time_s: Array) -> list[int]:
     Raises:
         MitsonarError: if ROS cannot represent the times.
     """
-    if not (np.isfinite(time_s).all() and (time_s >= 0).all() and (time_s < 2**31).all()):
-        raise MitsonarError("frame times must lie in 0..2^31 s for ROS: write the frames with other times")
+    time_s = np.where(abs(time_s) < 5e-10, 0.0, time_s)  # the middle of a sweep about 0 s
+    wrong = time_s[~((time_s >= 0) & (time_s < 2**31))]
+    if wrong.size:
+        raise MitsonarError(
+            f"frame times must lie in 0..2^31 s for ROS, and with first returns those of all pings: got {wrong[0]:.15g} s; "
+            "write the frames with other times, such as those of `mitsonar render --trajectory`"
+        )
     whole = np.floor(time_s)
     return [int(one) * 10**9 + round(float(part) * 1e9) for one, part in zip(whole, time_s - whole, strict=True)]
 

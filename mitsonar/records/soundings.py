@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -114,12 +115,12 @@ class Soundings:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read an npz file written by :meth:`save`.
+        """Read an npz file written by :meth:`save`, or the ``soundings.npz`` in the folder of a run.
 
         Raises:
             MitsonarError: a file that cannot be read or has another format.
         """
-        sounder, arrays = load_pings(path, MEASURED)
+        sounder, arrays = load_pings(_in_run(path, "soundings.npz"), MEASURED)
         return cls(arrays["time_s"], arrays["poses"], sounder, *(arrays[name] for name in MEASURED))
 
     def table(self) -> Array:
@@ -225,11 +226,12 @@ class Echogram:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file written by :meth:`save`.
+        """Read a file written by :meth:`save`, or the ``echogram.npz`` in the folder of a run.
 
         Raises:
             MitsonarError: a file that cannot be read or has another format.
         """
+        path = _in_run(path, "echogram.npz")
         sounder, arrays = load_pings(path, ("levels", "height_m"), constants=("origin",))
         levels, height_m = arrays["levels"].astype(np.float32, copy=False), arrays["height_m"]
         if height_m.ndim != 1 or (height_m <= 0).any() or not np.isfinite(levels).all() or (levels < 0).any():
@@ -414,6 +416,11 @@ def save_pings(path: str | Path, sounder: Sounder, arrays: dict[str, NDArray[Any
     table: dict[str, Any] = {"sounder": np.array(json.dumps(fields)), **arrays}
     np.savez_compressed(buffer, **table)
     write_atomic(Path(path), buffer.getvalue())
+
+
+def _in_run(path: str | Path, name: str) -> Path:
+    """Return the file of this name in a folder, or the path itself if it is none."""
+    return Path(path) / name if os.path.isdir(path) else Path(path)
 
 
 def load_pings(

@@ -561,7 +561,7 @@ def run_vehicle(
         MitsonarError: a sensor cannot follow the trajectory; or as in :func:`~mitsonar.simulation.runs.write_run`.
     """
     sensors, bodies = simulator.sensors(vehicle), simulator.bodies(vehicle)
-    refuse_path(sensors, vehicle, options.noise, exr=options.exr)
+    refuse_path(simulator.scene, sensors, vehicle, options.noise, exr=options.exr)
     others = [one.parent.name for one in Path(destination.folder).glob(f"*/{RUN_FILE}") if one.parent.name not in sensors]
     if destination.overwrite and others:
         raise MitsonarError(

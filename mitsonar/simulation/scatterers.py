@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
@@ -42,7 +42,7 @@ from mitsonar.simulation.tracing import height_below, hidden
 
 __all__ = [
     *("DIRECT", "ChannelTracer", "EchoBatch", "EchoValues", "LinkGeometry", "Moment", "ScattererPath", "Scatterers"),
-    *("absorption_rate", "link_table"),
+    *("absorption_rate", "link_table", "refuse_instances"),
 ]
 
 
@@ -790,10 +790,7 @@ class Scatterers:
         for number, shape in enumerate(scene.shapes()):
             chosen = among is None or number in among
             if chosen and shape.bsdf() is not None and number not in (smooth or ()) and not is_black(shape.bsdf()):
-                if shape.class_name() == "Instance":
-                    raise MitsonarError(
-                        f"scatterers cannot lie on instances: got {shape.id()}; give the scene meshes instead"
-                    )
+                refuse_instances([shape])
                 grid = _grid_of(shape) if sonar.scatterer_spacing_m is None else None
                 if grid is not None and not _is_covered_once(shape):
                     grid = None
@@ -855,6 +852,17 @@ class Scatterers:
         near = blocks.may_be_seen(np.arange(len(blocks.radius)), eye, axes, field)
         inner = (near[:, None] * BUCKETS_PER_BLOCK + np.arange(BUCKETS_PER_BLOCK)).ravel()
         return _ranges(self.first, buckets.may_be_seen(inner[inner < len(self.one_sided)], eye, axes, field))
+
+
+def refuse_instances(shapes: Iterable[mi.Shape]) -> None:
+    """Refuse shapes of a scene that would scatter and cannot carry scatterers.
+
+    Raises:
+        MitsonarError: a shape is an instance that is not black.
+    """
+    for shape in shapes:
+        if shape.class_name() == "Instance" and shape.bsdf() is not None and not is_black(shape.bsdf()):
+            raise MitsonarError(f"scatterers cannot lie on instances: got {shape.id()}; give the scene meshes instead")
 
 
 def _side(normal: NDArray[np.float32]) -> NDArray[np.int64]:

@@ -120,7 +120,7 @@ class VehicleSimulator:
             labels: whether to render per-pixel ground truth for imaging sonars.
         """
         bodies, sensors = self.bodies(vehicle), self.sensors(vehicle)
-        refuse_path(sensors, vehicle)
+        refuse_path(self.scene, sensors, vehicle)
         return {name: self._record(one, vehicle, bodies, labels) for name, one in sensors.items()}
 
     def _record(self, one: Mounted, vehicle: Trajectory, bodies: MovingBodies, labels: bool) -> Record:
@@ -136,26 +136,36 @@ class VehicleSimulator:
 
 
 def refuse_path(
-    sensors: Mapping[str, Mounted], vehicle: Trajectory, noise: NoiseModel | None = None, *, exr: bool = False
+    scene: mi.Scene,
+    sensors: Mapping[str, Mounted],
+    vehicle: Trajectory,
+    noise: NoiseModel | None = None,
+    *,
+    exr: bool = False,
 ) -> None:
-    """Refuse a trajectory that one of the sensors cannot follow, before any sensor is rendered.
+    """Refuse a trajectory or scene that one of the sensors cannot follow, before any sensor is rendered.
 
     Args:
+        scene: any Mitsuba scene.
         sensors: sensors keyed by name.
         vehicle: trajectory of the vehicle.
         noise: noise model for imaging sonars.
         exr: whether the echoes of each ray of imaging sonars are to be stored.
 
     Raises:
-        MitsonarError: the trajectory is too short for a sweep, noise is given for a sonar that already includes noise, or
-            a frame whose echoes are to be stored is several pings; the message names the sensor.
+        MitsonarError: the trajectory is too short for a sweep, noise is given for a sonar that already includes noise, a
+            frame whose echoes are to be stored is several pings, or hydrophones would hear instances; the message names the
+            sensor.
     """
+    from mitsonar.simulation.scatterers import refuse_instances
+
     for name, one in sensors.items():
-        if not isinstance(one.instrument, Sonar):
-            continue
         try:
-            path_to_render(one.instrument, vehicle, exr=exr)
-            refuse_noise(noise, one.instrument)
+            if isinstance(one.instrument, Sonar):
+                path_to_render(one.instrument, vehicle, exr=exr)
+                refuse_noise(noise, one.instrument)
+            elif isinstance(one.instrument, ChannelSonar) and one.instrument.model == "scatterers":
+                refuse_instances(scene.shapes())
         except MitsonarError as error:
             raise MitsonarError(f"sensor {name}: {error}") from None
 

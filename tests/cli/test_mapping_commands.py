@@ -290,6 +290,13 @@ def test_bad_options_are_answered_by_one_sentence(mitsonar: Command, drawn: Path
     assert not out.exists()
 
 
+def test_a_map_of_one_frame_has_no_standard_deviation(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
+    SonarFrames.load(drawn).select(slice(0, 1)).save(tmp_path / "one.npz")
+    done = mitsonar("mosaic", tmp_path / "one.npz", "true", "-o", tmp_path / "map.tif", "--cell-mm", 40)
+    assert done.returncode == 0, done.stderr
+    assert "no cell is lit by two frames" in done.stdout
+
+
 def test_a_bad_mosaic_is_answered_by_one_sentence(mitsonar: Command, drawn: Path, tmp_path: Path) -> None:
     out = tmp_path / "map.png"
     frames = SonarFrames.load(drawn)

@@ -102,6 +102,12 @@ def test_commands_and_options_have_neighbours_too(mitsonar: Command, typed: str)
     )
 
 
+def test_frames_beyond_any_memory_are_named(mitsonar: Command, tmp_path: Path) -> None:
+    done = mitsonar("render", "flat_floor", "--from", "0,0,2,30,0,0", "--frames", 10**13, "-o", tmp_path / "run")
+    refused(done, "out of memory; ask for less: frames or pings, beams")
+    assert not (tmp_path / "run").exists()
+
+
 # ---------------------------------------------------------------- options by the names that were typed
 
 

@@ -209,6 +209,14 @@ def test_a_topic_is_chosen(mitsonar: Command, tmp_path: Path) -> None:
     assert result["facts"]["topic"] == "/starboard"
 
 
+@pytest.mark.posix
+@pytest.mark.parametrize("target", ["gone.aris", "link.aris"])
+def test_a_link_to_nothing_or_itself_is_named_as_one(mitsonar: Command, tmp_path: Path, target: str) -> None:
+    (tmp_path / "link.aris").symlink_to(target)
+    done = mitsonar("recording", "info", "link.aris", cwd=tmp_path)
+    refused(done, f"no such file: link.aris is a link to {target}, which is missing")
+
+
 def test_a_missing_file_is_named_with_its_neighbour(mitsonar: Command, tmp_path: Path) -> None:
     (tmp_path / "dive.mcap").touch()
     for typed in (["recording", "info", "dvie.mcap"], ["odometry", "DIVE.MCAP", "-o", "out"]):

@@ -891,6 +891,21 @@ def test_sheets_of_vectors_and_views(tmp_path: Path) -> None:
     assert (tmp_path / "first.png").read_bytes() != (tmp_path / "second.png").read_bytes()
 
 
+def test_a_sheet_of_one_sequence_has_its_motion_once(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its motions are equal but for rounding, which no histogram can divide into bins."""
+    stored = DataStore.read
+
+    def read(store: DataStore, name: str, *where: Any) -> Any:
+        values = stored(store, name, *where)
+        if name == "motion":
+            values = np.full_like(values, 0.0209)
+            values[0] = np.nextafter(0.0209, 1)
+        return values
+
+    monkeypatch.setattr(DataStore, "read", read)
+    sheet_figure(DataStore.open(made), samples=1)
+
+
 def test_shards_can_be_made_by_hand(made: Path, tmp_path: Path) -> None:
     """What a worker does, without anybody to tell it: the function is enough."""
     url = copy_of(made, tmp_path)

@@ -157,6 +157,16 @@ def test_compare_in_python_is_the_table_of_the_command(
         compare(made, ",", ComparisonOptions(part="all"))
 
 
+def test_a_single_pair_is_refused_with_what_gives_more(made: Path, tmp_path: Path) -> None:
+    """The four pings of one sequence are one pair; all of the data set is no way out."""
+    one = {"scenes": [{"count": 1, "sequences": 1}], "flight": {"pings": 4}}
+    make_dataset(tiny_recipe(**one), str(tmp_path / "one.zarr"))
+    with pytest.raises(MitsonarError, match=r"one a sequence: got 1 in the part all; give a larger data set$"):
+        compare(tmp_path / "one.zarr", "zero", ComparisonOptions(part="all"))
+    with pytest.raises(MitsonarError, match=r"got 1 in the part validation; give part all, or a larger data set$"):
+        compare(made, "zero", ComparisonOptions())
+
+
 def test_a_folder_holds_the_estimates_of_its_estimators_only(made: Path, tmp_path: Path) -> None:
     """Another estimator under the same name must not get the estimates of the first."""
     options = ComparisonOptions(part="all", limit=0, pairs=2)

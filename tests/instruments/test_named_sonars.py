@@ -92,6 +92,7 @@ def test_sonar_from_leaves_its_argument() -> None:
     ("text", "message"),
     [
         ("beams: [1", "is not YAML"),
+        ("beams: 12\nrange_max: 5\nbeams: 64\n", "line 3: the key 'beams' occurs twice; leave one out"),
         ("- beams\n- 12\n", "must hold `key: value` lines"),
         ("", "must hold `key: value` lines"),
         ("12: 3\n", "must hold `key: value` lines"),

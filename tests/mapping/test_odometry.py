@@ -580,6 +580,8 @@ def test_a_planar_path_takes_the_frames_pitch_and_another_keeps_its_own() -> Non
     np.testing.assert_array_equal(source.along(Trajectory(local, path.time_s))[1], local)
     with pytest.raises(MitsonarError, match=r"no pose is within 0.01 s of a frame: give the path of this run"):
         source.along(Trajectory(path.poses, path.time_s + 100))
+    with pytest.raises(MitsonarError, match=r"lasts from 1764424800 to 1764424800.9 s, "):
+        source.along(Trajectory(path.poses, 1764424800 + 0.1 * np.arange(10)))
     # the path's own where sensors miss a frame
     lean = np.full((10, 3), 0.4)
     lean[3] = np.nan
@@ -622,6 +624,9 @@ def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
     (tmp_path / "with two" / "b.aris").write_bytes(aris_file())
     write_xtf(tmp_path / "with two" / "c.xtf", side_scan_echogram())
     (tmp_path / "with two" / "notes.txt").write_text("none")
+    (tmp_path / "vehicle" / "ahead").mkdir(parents=True)
+    numbered(sway(4)).save(tmp_path / "vehicle" / "ahead" / "frames.npz")
+    write_xtf(tmp_path / "vehicle" / "c.xtf", side_scan_echogram())
     (tmp_path / "wrong.npz").write_bytes(b"no zip")
     (tmp_path / "empty.aris").touch()
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
@@ -632,6 +637,7 @@ def test_what_holds_no_frames_is_said(tmp_path: Path) -> None:
         ("empty", r"holds no frames\.npz or frames\.zarr: give frames\.npz"),
         ("with one", r"holds no frames\.npz or frames\.zarr: give the recording in it, .*with one.a\.aris"),
         ("with two", r"holds no frames\.npz or frames\.zarr: give one of the recordings in it: b\.aris, c\.xtf$"),
+        ("vehicle", r"give one of the recordings in it: ahead, c\.xtf$"),
         ("none.aris", r"no such file: .*none\.aris; give frames\.npz, .* or a recording"),
         ("wrong.npz", r"cannot read frames .*: it is neither a whole frames\.npz nor a recording .*: ARIS \(\.aris\), "),
         ("empty.aris", r"cannot read frames .*empty\.aris: it is empty; give .* a recording: ARIS \(\.aris\), "),
@@ -671,6 +677,14 @@ def run(
     files = files_of(out)
     assert set(files) == RESULTS
     return {name: content for name, content in files.items() if name not in ("run.json", "path.png")}
+
+
+def test_motions_keep_the_times_of_a_clock(tmp_path: Path) -> None:
+    """Seconds since 1970, as recordings count them, keep their fractions."""
+    path = Trajectory(sway(4).poses, 1764424800.125 + 0.25 * np.arange(4))
+    run(tmp_path / "out", path)
+    rows = csv.DictReader((tmp_path / "out/motions.csv").open())
+    assert [float(row["time_s"]) for row in rows] == path.time_s[1:].tolist()
 
 
 def test_a_folder_holds_the_path_and_all_about_it(tmp_path: Path) -> None:

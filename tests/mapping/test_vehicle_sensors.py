@@ -344,6 +344,7 @@ def test_sensors_of_other_times_share_a_file(tmp_path: Path) -> None:
         ("time_s,depth_m,depth_std_m\n0,nan,1\n", "must be a number"),
         ("time_s,depth_m,depth_std_m\n0,inf,1\n", "must be a number"),
         ("time_s,depth_m,depth_std_m\n0,1_0,1\n", "must be a number"),
+        ("time_s,depth_m,depth_std_m\n17644248000000000,1,1\n", r"'17644248000000000'; numbers up to 1e\+12 are read"),
         ("time_s,depth_m,depth_std_m\n,1,1\n", "time_s must be a number"),
         ("time_s,depth_m,depth_std_m\n1,1,1\n0,1,1\n", "column depth_m: times of readings must increase"),
         ("time_s,depth_m,depth_std_m\n0,,1\n", "hold no reading"),
@@ -365,6 +366,7 @@ def test_readings_that_are_none_are_refused() -> None:
         ({"values": np.zeros(2)}, "a time, a value"),
         ({"values": np.array([0, np.nan, 0])}, "finite"),
         ({"time_s": np.zeros(3)}, "increase"),
+        ({"time_s": 1764424800.5 - time}, "got 1764424799.5 s after 1764424800.5"),
         ({"std": np.zeros(3)}, "above 0"),
     ):
         with pytest.raises(MitsonarError, match=message):

@@ -209,6 +209,7 @@ GOOD = "0 0 0 0 0 0 0 1"
         ("1 0 0 oops 0 0 0 1", "expected .* got '1 0 0 oops 0 0 0 1'"),
         ("1 0 nan 0 0 0 0 1", "finite numbers"),
         ("1 0 0 inf 0 0 0 1", "finite numbers"),
+        ("1764424800000000000 0 0 0 0 0 0 1", r"up to 1e\+12 \(times in s\)"),
         ("1 0 0 0 0 0 0 0", "a quaternion other than zero"),
         ("0 0 0 0 0 0 0 1", "time must increase"),
         ("-1 0 0 0 0 0 0 1", "time must increase"),

@@ -238,6 +238,16 @@ def test_beams_of_interleaved_groups_have_one_time(tmp_path: Path) -> None:
     assert scan.angle_min == pytest.approx(-sonar.bearing_rad[-1], abs=1e-6)
 
 
+def test_a_sweep_that_begins_before_ros_has_times_is_refused_with_the_time(tmp_path: Path) -> None:
+    """A sweep at a single pose without a path has its middle at 0 s."""
+    frames = room((0, 0, 0), sweeps=1)
+    frames.time_s -= frames.time_s.mean()
+    begin = frames.time_s.min()
+    with pytest.raises(MitsonarError, match=f"all pings: got {begin:.15g} s; .* `mitsonar render --trajectory`"):
+        write_mcap([frames], tmp_path / "a.mcap", returns=FirstReturns(-5.0))
+    write_mcap([frames], tmp_path / "b.mcap")  # one time a sweep, its middle
+
+
 def test_levels_that_find_nothing_or_ringing_are_noted(tmp_path: Path) -> None:
     sonar = Sonar(beams=4, range_bins=5, range_min=1.0, range_max=1.5)
     image = np.zeros((1, 5, 4), np.float32)

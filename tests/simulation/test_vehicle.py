@@ -172,3 +172,14 @@ def test_a_sensor_that_cannot_follow_is_named_before_any_is_rendered(tank: Path,
     assert not (tmp_path / "run").exists()
     with pytest.raises(MitsonarError, match="sensor head: a sweep"):
         simulator.render(PATH)
+
+
+def test_hydrophones_over_instances_are_refused_before_any_sensor_is_rendered(tmp_path: Path) -> None:
+    from mitsonar.acoustics.noise import NOISE_MODELS
+    from mitsonar.simulation.runs import Destination, RenderOptions
+
+    (tmp_path / "auv.yaml").write_text("sensors:\n  ahead: {sonar: {beams: 12}}\n  ears: {hydrophones: {}}\n")
+    simulator = VehicleSimulator(load_scene("objects"), load_vehicle(tmp_path / "auv.yaml").sensors)
+    with pytest.raises(MitsonarError, match="sensor ears: scatterers cannot lie on instances: got cannon"):
+        run_vehicle(simulator, PATH, RenderOptions(NOISE_MODELS["none"]), Destination(tmp_path / "run"))
+    assert not (tmp_path / "run").exists()

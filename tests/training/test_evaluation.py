@@ -404,6 +404,7 @@ def test_a_comparison_marks_pairs_that_a_network_may_have_learnt_from(mitsonar: 
     assert done.returncode == 0, done.stderr
     assert f"network.ckpt (learnt {mixed})" in done.stdout
     assert f"was trained on {mixed} of the {len(by_sequence)} pairs" in done.stderr
+    assert "too small; take the part validation, or other data" in done.stderr
     refused(mitsonar("compare", made, "--split", "world"), "split must be sequence, scene")
     second = constant(SonarPairs(made, part="all", labels="normx10"), recipe={"split": "sequence"})
     with pytest.raises(

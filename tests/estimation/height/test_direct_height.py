@@ -18,7 +18,7 @@ from mitsonar.datasets.make import make_dataset
 from mitsonar.datasets.store import DataStore
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.height import DirectHeight, FloorProfile, HeightEstimate, heights_lines
+from mitsonar.estimation.height import DirectHeight, FloorProfile, HeightEstimate, heights_csv, heights_lines
 from mitsonar.estimation.named import height_estimator_from
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.instruments.sounder import load_sonar
@@ -162,6 +162,12 @@ def test_heights_of_a_data_set_s_vectors(heights: Path, tmp_path: Path, mitsonar
     refused(mitsonar("height", heights, "-o", tmp_path / "heights.csv"), "exists and is kept as it is")
     refused(mitsonar("height", heights, "--by", "directly"), "a height estimator is direct, a checkpoint")
     refused(mitsonar("height", heights, "--view", "q1"), "has no vectors of view 'q1'")
+
+
+def test_a_table_of_heights_keeps_the_times_of_a_clock() -> None:
+    times = 1764424800.125 + 0.25 * np.arange(3)
+    table = csv.DictReader(heights_csv(times, [HeightEstimate(2.0, 0.1)] * 3, None).splitlines())
+    assert [float(row["time_s"]) for row in table] == times.tolist()
 
 
 def test_a_depth_is_no_height_to_compare_with() -> None:
