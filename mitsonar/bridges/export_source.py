@@ -210,8 +210,8 @@ def _parts_by_time(frames: int, split: tuple[float, float, float]) -> NDArray[np
     counts[int(np.argmax(split))] -= counts.sum() - frames
     if (counts[has_share] < 1).any():
         raise MitsonarError(
-            f"{frames} frames are too few for the shares {split} of training, validation and test: "
-            "give more frames, or another --split"
+            f"the shares {split} of training, validation and test need at least one frame each: got {frames}; give more "
+            "frames, or another --split"
         )
     return np.repeat(np.array(PARTS, dtype="<U10"), counts)
 

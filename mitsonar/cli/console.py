@@ -197,8 +197,12 @@ def answered(command: Callable[P, R], options: Mapping[str, str] | None = None) 
         except OSError as error:
             _silence_asyncio()
             where = f" ({error.filename})" if error.filename else ""
-            full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-            typer.echo(f"error: {error.strerror or error}{where}{_resume_hint(command) if full else ''}", err=True)
+            hint = ""
+            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+                hint = _resume_hint(command)
+            elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+                hint = "; change its permissions, or give another path"
+            typer.echo(f"error: {error.strerror or error}{where}{hint}", err=True)
         except MemoryError:
             less = "frames or pings, beams, rays or bins of the sonar, objects of a world"
             typer.echo(f"error: out of memory; ask for less: {less}", err=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import pickle
@@ -271,6 +272,17 @@ def test_a_signal_ends_a_command_with_a_sentence(
         assert end.value.exit_code == code
         assert capfd.readouterr().err == f"stopped{words}\n"
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_what_may_not_be_read_or_written_is_one_sentence(capfd: pytest.CaptureFixture[str]) -> None:
+    def write() -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", "maps/.map.png.part")
+
+    with pytest.raises(typer.Exit) as end:
+        answered(write)()
+    assert end.value.exit_code == 2
+    sentence = "error: Permission denied (maps/.map.png.part); change its permissions, or give another path\n"
+    assert capfd.readouterr().err == sentence
 
 
 @pytest.mark.posix
