@@ -581,7 +581,7 @@ def test_a_planar_path_takes_the_frames_pitch_and_another_keeps_its_own() -> Non
     with pytest.raises(MitsonarError, match=r"no pose is within 0.01 s of a frame: give the path of this run"):
         source.along(Trajectory(path.poses, path.time_s + 100))
     with pytest.raises(MitsonarError, match=r"lasts from 1764424800 to 1764424800.9 s, "):
-        source.along(Trajectory(path.poses, 1764424800 + 0.1 * np.arange(10)))
+        source.along(Trajectory(path.poses, 1764424800 + 0.1 * np.arange(10.0)))
     # the path's own where sensors miss a frame
     lean = np.full((10, 3), 0.4)
     lean[3] = np.nan
@@ -681,7 +681,7 @@ def run(
 
 def test_motions_keep_the_times_of_a_clock(tmp_path: Path) -> None:
     """Seconds since 1970, as recordings count them, keep their fractions."""
-    path = Trajectory(sway(4).poses, 1764424800.125 + 0.25 * np.arange(4))
+    path = Trajectory(sway(4).poses, 1764424800.125 + 0.25 * np.arange(4.0))
     run(tmp_path / "out", path)
     rows = csv.DictReader((tmp_path / "out/motions.csv").open())
     assert [float(row["time_s"]) for row in rows] == path.time_s[1:].tolist()

@@ -165,7 +165,7 @@ def test_heights_of_a_data_set_s_vectors(heights: Path, tmp_path: Path, mitsonar
 
 
 def test_a_table_of_heights_keeps_the_times_of_a_clock() -> None:
-    times = 1764424800.125 + 0.25 * np.arange(3)
+    times = 1764424800.125 + 0.25 * np.arange(3.0)
     table = csv.DictReader(heights_csv(times, [HeightEstimate(2.0, 0.1)] * 3, None).splitlines())
     assert [float(row["time_s"]) for row in table] == times.tolist()
 
