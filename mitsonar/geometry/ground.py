@@ -651,23 +651,17 @@ class Attitude:
         apart = self.apart[number] if self.apart else NOT_APART
         return self.height_m + apart.height_m - lift_m, self.pitch_rad + apart.pitch_rad, self.roll_rad + apart.roll_rad
 
-    def widened(
-        self, covariance: NDArray[np.float64], frames: SonarFrames, by_lean: NDArray[np.float64] | None = None
-    ) -> NDArray[np.float64]:
+    def widened(self, covariance: NDArray[np.float64], frames: SonarFrames) -> NDArray[np.float64]:
         """Return the covariance of a motion ``(3, 3)``, enlarged for unknown heave, pitch and roll.
 
         Args:
             covariance: covariance of sideways, forward [m], yaw [rad], assuming equal height and attitude in both frames.
             frames: the two frames.
-            by_lean: change of the estimate per metre and radian of what :attr:`lean_std` describes ``(3, 5)``; default:
-                that of least squares over the lit ground for the changes, none for the means.
         """
-        if not self.lean_std.any():
+        std = np.array(self.unsure)
+        if not std.any():
             return covariance
-        if by_lean is None:
-            half = np.radians(frames.sonar.elevation_fov_deg) / 2
-            by_lean = np.column_stack([self.ground(frames).motion_per_attitude(COARSE, half), np.zeros((3, 2))])
-        apparent = by_lean * self.lean_std
+        apparent = self.ground(frames).motion_per_attitude(COARSE, np.radians(frames.sonar.elevation_fov_deg) / 2) * std
         return np.asarray(covariance + apparent @ apparent.T)
 
     def ground(self, frames: SonarFrames, number: int | None = None) -> GroundGeometry:

@@ -458,7 +458,7 @@ def test_stretches_of_a_run_are_disjoint_and_cover_it(run: Path, tmp_path: Path)
         assert len(parts) == FRAMES
         assert set(parts) == {part for part, share in zip(("train", "validation", "test"), split, strict=True) if share}
     SonarFrames.load(run).select(slice(0, 2)).save(tmp_path / "two.npz")
-    with pytest.raises(MitsonarError, match="2 frames are too few"):
+    with pytest.raises(MitsonarError, match="need at least one frame each: got 2; give more"):
         open_export(tmp_path / "two.npz", split=(0.7, 0.15, 0.15))
 
 

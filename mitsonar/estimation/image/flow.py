@@ -161,16 +161,17 @@ class WindowGrid:
         map_there = np.stack(self._higher[1].to_polar(moved(self._higher_points, v)), axis=-1) - self.home
         return (np.nan_to_num(map_there - self.map(v)) / HEIGHT_STEP)[..., None]
 
-    def by_lean(self, v: Doubles) -> Doubles:
-        """Return the derivative of the map by height and attitude of both frames ``(n, m, 2, 5)``.
+    def by_unsure(self, v: Doubles) -> Doubles:
+        """Return the derivative of the map by the relative height and by height and attitude of both frames.
 
-        See :func:`~mitsonar.geometry.ground.lean_derivative`.
+        ``(n, m, 2, 6)``, see :func:`~mitsonar.geometry.ground.lean_derivative`.
         """
         rows, columns = self.centres
         first, second = (
             replace(one, range_m=one.range_m[rows], bearing_rad=one.bearing_rad[columns]) for one in self._both_grounds
         )
-        return np.moveaxis(np.nan_to_num(lean_derivative(first, second, v)), (1, 0), (2, 3))
+        by_lean = np.moveaxis(np.nan_to_num(lean_derivative(first, second, v)), (1, 0), (2, 3))
+        return np.concatenate([self.by_height(v), by_lean], axis=-1)
 
 
 @lru_cache(maxsize=16)
@@ -216,14 +217,10 @@ fraction of the structure that lies twice as far from the axis in elevation as t
 
 
 class _Fit(NamedTuple):
-    """Result of a level: correlation of the matched frames, structure in each window, whether the rounds settled.
-
-    For the others see :class:`MapMatch`.
-    """
+    """Motion, covariance, correlation of the matched frames, structure in each window, and whether the rounds settled."""
 
     motion: Doubles
     covariance: Doubles | None
-    by_window: Doubles
     correlation: float
     structure: Doubles
     converged: bool
@@ -275,12 +272,13 @@ class Flow:
         first, second = two_frames(frames)
         attitude = attitude_of(frames, "flow", self.height_m, self.pitch_rad, self.relief_m)
         height_std = attitude.height_std_m / attitude.height_m if self.height_std is None else self.height_std
+        unsure = np.array([height_std, *attitude.lean_std])
         axes = tuple(frames.range_m.tolist()), tuple(frames.bearing_rad.tolist())
         v = np.zeros(3)
         fit = None
         for level in self.levels:
             grid = window_grid(*axes, frames.sonar.bearing, attitude.of_frame(0), attitude.of_frame(1), level)
-            fit = self._register(_smoothed(first, level), _smoothed(second, level), grid, v, height_std)
+            fit = self._register(_smoothed(first, level), _smoothed(second, level), grid, v, unsure)
             if fit is None:
                 return Estimate(Motion(0.0, 0.0, 0.0), None, False, "nothing in the frames to match")
             v = fit.motion
@@ -289,19 +287,22 @@ class Flow:
         blocks = _blocks(fit.structure)
         reason = attitude.reason or _rejection(fit, blocks, unseen)
         about = {"correlation": float(fit.correlation), "blocks": blocks, "unseen": unseen, **attitude.about}
-        covariance = None
-        if fit.covariance is not None:
-            by_lean = np.einsum("inmd,nmdk->ik", fit.by_window, grid.by_lean(v)) if attitude.lean_std.any() else None
-            covariance = attitude.widened(MODEL * fit.covariance, frames, by_lean)
+        covariance = None if fit.covariance is None else MODEL * fit.covariance
+        if covariance is not None and self.match == "vector":
+            covariance = attitude.widened(covariance, frames)
         return Estimate(Motion(*(float(x) for x in v)), covariance, not reason, reason, about)
 
-    def _register(self, first: Floats, second: Floats, grid: WindowGrid, start: Doubles, height_std: float) -> _Fit | None:
-        """Run rounds of flow and match from a start; return None if there is nothing to match."""
+    def _register(self, first: Floats, second: Floats, grid: WindowGrid, start: Doubles, unsure: Doubles) -> _Fit | None:
+        """Run rounds of flow and match from a start; return None if there is nothing to match.
+
+        ``unsure``: standard deviations of the relative height and of :attr:`Attitude.lean_std` ``(6,)``.
+        """
         v, converged = start, False
+        by_unsure = Unsure(grid.by_unsure(v)[..., unsure > 0], unsure[unsure > 0])
         for _ in range(grid.level.rounds):
             warped, inside = _warped(second, grid, v)
             flow = _flow(first, warped, inside, grid)
-            match = match_map(grid, flow, v, height_std) if self.match == "map" else match_vector(grid, flow, v)
+            match = match_map(grid, flow, v, by_unsure) if self.match == "map" else match_vector(grid, flow, v)
             if match is None:
                 return None
             step = match.motion - v
@@ -312,7 +313,7 @@ class Flow:
                 break
         assert match is not None
         correlation = _correlation(first, warped, inside, grid)
-        return _Fit(v, match.covariance, match.by_window, correlation, _structure(flow, grid), converged)
+        return _Fit(v, match.covariance, correlation, _structure(flow, grid), converged)
 
 
 def _smoothed(image: Floats, level: FlowLevel) -> Floats:
@@ -473,39 +474,44 @@ class WindowFlow(NamedTuple):
 
 
 class MapMatch(NamedTuple):
-    """A motion that matches a displacement map.
-
-    Attributes:
-        motion: sideways, forward [m], yaw [rad] ``(3,)``.
-        covariance: its covariance ``(3, 3)``; None where the match is not a maximum.
-        by_window: change of the motion per metre and radian of each window's displacement ``(3, n, m, 2)``.
-    """
+    """A motion and its covariance; the covariance is None where the match is not a maximum."""
 
     motion: Doubles
     covariance: Doubles | None
-    by_window: Doubles
 
 
-def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float) -> MapMatch | None:
+class Unsure(NamedTuple):
+    """What is known of height and attitude up to an error.
+
+    Attributes:
+        derivative: of the map by each ``(n, m, 2, unsure)``.
+        std: standard deviation of each error ``(unsure,)``.
+    """
+
+    derivative: Doubles
+    std: Doubles
+
+
+def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, unsure: Unsure) -> MapMatch | None:
     """Fit the exact map of a motion to the displacement map by robust weighted least squares; return None if singular.
 
-    The unknowns are the motion and, unless ``height_std`` is 0, the relative change of the height.
+    The unknowns are the motion and the errors of height and attitude, with a prior.
     """
     measured = grid.map(v) + flow.displacement
-    unknowns = grid.derivative if not height_std else np.concatenate([grid.derivative, grid.by_height(v)], axis=-1)
+    unknowns = np.concatenate([grid.derivative, unsure.derivative], axis=-1)
     used = flow.information.any(axis=(2, 3))
     if used.sum() < BLOCK * BLOCK:
         return None
-    p = np.append(v, 0.0)[: unknowns.shape[-1]]
-    prior = np.zeros(len(p))
+    p = np.append(v, np.zeros(len(unsure.std)))
+    prior, std = np.zeros(len(p)), np.append(np.zeros(3), unsure.std)
     for _ in range(10):
         # misfit of the windows, and its usual square
         misfit = measured - grid.map(p[:3]) - (unknowns[..., 3:] @ p[3:])
         gradient = (flow.information @ misfit[..., None])[..., 0]
         squared = np.maximum((misfit * gradient).sum(axis=-1), 0)
         usual_square = float(np.median(squared[used])) / 1.39 + TINY  # the median of chi-square with 2 degrees of freedom
-        # the prior of the height in units of the misfit; robust weights of the windows
-        prior[3:] = usual_square * BLOCK**2 / height_std**2 if height_std else 0.0
+        # the prior of height and attitude in units of the misfit; robust weights of the windows
+        prior[3:] = usual_square * BLOCK**2 / unsure.std**2
         weight = 1 / (1 + squared / (CAUCHY * usual_square))
         # Gauss-Newton step
         scores = _apply(unknowns, gradient) * weight[..., None]
@@ -516,13 +522,11 @@ def match_map(grid: WindowGrid, flow: WindowFlow, v: Doubles, height_std: float)
         p = p + step
         if (np.abs(step[:3]) < STILL / 10).all():
             break
-    weighted = flow.information * weight[..., None, None] @ unknowns
-    by_window = np.moveaxis(weighted @ np.linalg.inv(normal)[:, :3], -1, 0)
     # robust scores rise by the squared weight over both directions; only the shared slopes are free of either frame's noise
     normals = _normal(unknowns, flow.shared * (weight * weight)[..., None, None])
     if not _regular(normals.sum(axis=(0, 1)) + np.diag(prior)):
-        return MapMatch(p[:3], None, by_window)
-    return MapMatch(p[:3], _covariance(normals, scores, prior, height_std), by_window)
+        return MapMatch(p[:3], None)
+    return MapMatch(p[:3], _covariance(normals, scores, prior, std))
 
 
 def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | None:
@@ -553,8 +557,7 @@ def match_vector(grid: WindowGrid, flow: WindowFlow, v: Doubles) -> MapMatch | N
     # noise in the slopes shortens the flow by this factor
     gain = np.linalg.pinv(flow.information, hermitian=True) @ flow.shared
     normals = np.swapaxes(summary, -1, -2) @ gain @ grid.derivative
-    by_window = np.moveaxis(summary @ np.linalg.inv(slope).T, -1, 0)
-    return MapMatch(v, _covariance(normals, scores, np.zeros(3), 0.0), by_window)
+    return MapMatch(v, _covariance(normals, scores, np.zeros(3), np.zeros(3)))
 
 
 def _apply(unknowns: Doubles, gradient: Doubles) -> Doubles:
@@ -574,20 +577,20 @@ def _regular(normal: Doubles) -> bool:
     return bool(eigenvalues[0] > 1e-8 * eigenvalues[-1])
 
 
-def _covariance(normals: Doubles, scores: Doubles, prior: Doubles, height_std: float) -> Doubles | None:
+def _covariance(normals: Doubles, scores: Doubles, prior: Doubles, std: Doubles) -> Doubles | None:
     """Return the covariance of the motion ``(3, 3)``; None where a single block decides.
 
-    It sums the changes when one block of windows is left out (jackknife) and the uncertainty of the assumed height.
+    It sums the changes when one block of windows is left out (jackknife) and those by what is unsure.
     """
     block_normals, block_scores = in_blocks(normals), in_blocks(scores)
     total = block_normals.sum(axis=0) + np.diag(prior)
     try:
         change = np.linalg.solve(total - block_normals, block_scores[..., None])[..., 0]
-        by_height = np.linalg.solve(total, np.diag(prior * height_std))
+        by_unsure = np.linalg.solve(total, np.diag(prior * std))
     except np.linalg.LinAlgError:
         return None
     blocks = len(block_normals)
-    return np.asarray((change.T @ change * (blocks - 1) / blocks + by_height @ by_height.T)[:3, :3])
+    return np.asarray((change.T @ change * (blocks - 1) / blocks + by_unsure @ by_unsure.T)[:3, :3])
 
 
 def in_blocks(values: Doubles) -> Doubles:

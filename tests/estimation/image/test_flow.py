@@ -7,13 +7,13 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from helpers import essence
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage, special
 
 from mitsonar.acoustics.noise import NOISE_MODELS
 from mitsonar.errors import MitsonarError
 from mitsonar.estimation.image.flow import Flow
-from mitsonar.geometry.ground import UNKNOWN_PER_S, GroundGeometry
+from mitsonar.geometry.ground import GroundGeometry
 from mitsonar.instruments.sonar import Sonar
 from mitsonar.motion.composition import Motion, compose
 from mitsonar.motion.pose import Pose
@@ -37,14 +37,14 @@ def ground(seed: int) -> NDArray[np.float64]:
 
 
 def painted(
-    motion: Motion, sonar: Sonar, seeds: tuple[int, int] = (1, 1), pose: Pose = START, roll_rad: float = 0.0
+    motion: Motion, sonar: Sonar, seeds: tuple[int, int] = (1, 1), pose: Pose = START, lean: ArrayLike = 0.0
 ) -> SonarFrames:
     """Two frames, the motion apart, of painted level ground: each cell shows its ground point, without any ray tracing.
 
-    The second rolls by as much more.
+    The pose of the second changes by ``lean``, too.
     """
     poses = np.array([pose, compose(pose, motion)])
-    poses[1, 4] += roll_rad
+    poses[1] += lean
     images = []
     for seed, (x, y, height, pitch, roll, heading) in zip(seeds, poses, strict=True):
         aside, ahead = np.moveaxis(
@@ -110,23 +110,27 @@ def test_covariance_says_the_errors_that_noise_makes() -> None:
     assert ((rms > 0.3) & (rms < 2.0)).all(), rms
 
 
-def test_a_roll_that_no_sensor_tells_is_in_the_covariance() -> None:
-    """A roll of one standard deviation between the frames turns the answer by what it adds to the covariance.
-
-    Ranges keep, bearings change with elevation: 9 mm aside and a yaw of 0.15 deg explain them together.
-    """
-    roll_rad = UNKNOWN_PER_S.roll_rad * 0.1
-    frames = painted(Motion(0.02, 0.02, 0.0), Sonar(), roll_rad=roll_rad)
+@pytest.mark.parametrize(("axis", "change"), [(2, 0.01), (4, np.radians(0.4))])
+def test_heave_and_roll_that_no_sensor_tells_are_further_unknowns(axis: int, change: float) -> None:
+    """They look like 6 mm forwards, and like 9 mm aside with a yaw of 0.15 deg, unless the match may estimate them."""
+    lean = np.zeros(6)
+    lean[axis] = change
+    motion, sonar = Motion(0.02, 0.02, 0.0), Sonar()
+    frames, level = painted(motion, sonar, lean=lean), painted(motion, sonar)
     estimator = Flow(height_m=2.5, pitch_rad=START.pitch, relief_m=0)
-    known, unknown = estimator.estimate(frames), estimator.estimate(changed(frames, poses=None))
+    known = estimator.estimate(frames)
+    wrong, unknown = (estimator.estimate(changed(frames, poses=poses)) for poses in (level.poses, None))
     assert known.covariance is not None
     assert unknown.covariance is not None
-    turned = np.array(unknown.motion) - known.motion
-    assert abs(turned[0]) > 5e-3
-    assert 0.8 < turned @ np.linalg.solve(unknown.covariance - known.covariance, turned) < 1.2
-    level = GroundGeometry(frames.range_m, frames.bearing_rad, "azimuth", 2.5, START.pitch)
-    of_networks = level.motion_per_attitude(12, np.radians(7))[:, 2] * roll_rad  # which have no windows
-    np.testing.assert_allclose(of_networks[[0, 2]], turned[[0, 2]], rtol=0.4)
+    error, corrected = (np.array(one.motion) - motion for one in (wrong, unknown))
+    assert np.abs(error[:2]).max() > 4e-3
+    assert np.abs(corrected[:2]).max() < np.abs(error[:2]).max() / 4
+    assert corrected @ np.linalg.solve(unknown.covariance, corrected) < 6
+    assert np.linalg.det(unknown.covariance) > np.linalg.det(known.covariance)
+    if axis == 4:
+        ground = GroundGeometry(frames.range_m, frames.bearing_rad, "azimuth", 2.5, START.pitch)
+        of_networks = ground.motion_per_attitude(12, np.radians(7))[:, 2] * change  # which do not estimate it
+        np.testing.assert_allclose(of_networks[[0, 2]], error[[0, 2]], rtol=0.4)
 
 
 def test_height_is_a_further_unknown() -> None:
