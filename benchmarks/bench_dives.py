@@ -1,6 +1,7 @@
-"""`direct` on pairs of frames of dives at many places, with what a vehicle knows and without.
+"""`direct`, or another method, on pairs of frames of dives at many places, with what a vehicle knows and without.
 
     python benchmarks/bench_dives.py --out bench/dives [--sonars didson300,gemini-720is] [--flights gentle] [--worlds 12]
+        [--method flow]
 
 Frames of a dive see the same rocks, so that the NEES of a few worlds scatters. Here each pair has a place, a heading and a
 moment of the flight of its own, five in each world; no world is one of `mitsonar benchmark odometry`. *all*: height, pitch
@@ -21,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import mitsonar
-from mitsonar.estimation.estimator import Estimate
-from mitsonar.estimation.image.direct import Direct
+from mitsonar.estimation.estimator import AnyEstimator, Estimate
+from mitsonar.estimation.named import create_estimator
 from mitsonar.instruments.sounder import preset
 from mitsonar.motion.composition import motions
 from mitsonar.motion.errors import MotionErrors, motion_errors
@@ -46,22 +47,24 @@ def main() -> None:
     parser.add_argument("--sonars", default=",".join(one_ping))
     parser.add_argument("--flights", default=",".join(FLIGHTS))
     parser.add_argument("--worlds", type=int, default=12)
+    parser.add_argument("--method", default="direct", help="a method that takes pitch_deg")
     parser.add_argument("--quick", action="store_true", help="two pairs of one sonar, kept nowhere: within a minute")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     print(f"| sonar | texture | flight | pairs | {' | NEES | '.join(KNOWN)} | NEES |\n{'|---' * (4 + 2 * len(KNOWN))}|")
     if not arguments.quick:
-        return measure(arguments.out, arguments.sonars.split(","), arguments.flights.split(","), arguments.worlds, PLACES)
+        sonars, flights = arguments.sonars.split(","), arguments.flights.split(",")
+        return measure(arguments.out, sonars, flights, arguments.worlds, PLACES, arguments.method)
     with tempfile.TemporaryDirectory() as folder:
-        measure(Path(folder), ["didson300"], ["gentle"], 1, 2)
+        measure(Path(folder), ["didson300"], ["gentle"], 1, 2, arguments.method)
 
 
-def measure(out: Path, sonars: list[str], flights: list[str], worlds: int, places: int) -> None:
+def measure(out: Path, sonars: list[str], flights: list[str], worlds: int, places: int, method: str) -> None:
     """Print a row for each sonar, texture and flight."""
     for name in sonars:
         for flight in flights:
             for texture in TEXTURES:
-                result = errors_of(out, SETS[f"dive-{name}-{flight}-3"], texture, worlds, places)
+                result = errors_of(out, SETS[f"dive-{name}-{flight}-3"], texture, worlds, places, method)
                 cells = (f"{triple(one)} | {one.nees:.2f}" for one in result)
                 print(f"| {name} | {texture} | {flight} | {worlds * places} | {' | '.join(cells)} |", flush=True)
 
@@ -72,7 +75,7 @@ def triple(errors: MotionErrors) -> str:
     return "{:.2f} / {:.2f} / {:.3f}".format(*errors.believed) + rejected
 
 
-def errors_of(out: Path, dive: SimulatedSet, texture: str, worlds: int, places: int) -> list[MotionErrors]:
+def errors_of(out: Path, dive: SimulatedSet, texture: str, worlds: int, places: int, method: str) -> list[MotionErrors]:
     """Errors on the pairs of all worlds, by what is known."""
     true: list[Array] = []
     answers: dict[str, list[Estimate]] = {known: [] for known in KNOWN}
@@ -81,7 +84,7 @@ def errors_of(out: Path, dive: SimulatedSet, texture: str, worlds: int, places: 
             assert frames.poses is not None
             true.append(motions(frames.poses)[0])
             for known in KNOWN:
-                answers[known].append(estimator_of(dive, known).estimate(reported(frames, known)))
+                answers[known].append(estimator_of(dive, known, method).estimate(reported(frames, known)))
     unknown = np.full((3, 3), np.nan)
     return [
         motion_errors(
@@ -136,9 +139,9 @@ def reported(frames: SonarFrames, known: str) -> SonarFrames:
     return replace(frames, poses=None, height_m=None, attitude_rad=lean)
 
 
-def estimator_of(dive: SimulatedSet, known: str) -> Direct:
-    """``direct``, given the pitch of the mount where nothing else is known."""
-    return Direct(pitch_rad=float(np.radians(dive.pitch_deg))) if known == "pitch" else Direct()
+def estimator_of(dive: SimulatedSet, known: str, method: str) -> AnyEstimator:
+    """Return a method, given the pitch of the mount where nothing else is known."""
+    return create_estimator(method, **({"pitch_rad": float(np.radians(dive.pitch_deg))} if known == "pitch" else {}))
 
 
 if __name__ == "__main__":
