@@ -20,7 +20,8 @@ Almanza-Medina gives no further details. This implementation makes the following
   displacement distribution". The paper does not specify it. Here it is the mean displacements in range and in bearing
   and the slope of the displacement in range over bearing, without weights.
 - The height over the visible surface comes from the first echoes, or from the frames. It is known only to ``height_std``
-  and is a fourth unknown of the match: rocks rise above the ground to which the height is measured.
+  and is a fourth unknown of the match: rocks rise above the ground to which the height is measured. Heave, pitch and roll
+  that no sensor measures are further unknowns, of the size that is usual on a calm day.
 """
 
 from __future__ import annotations
