@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -81,7 +82,7 @@ def _is_ros2_folder(path: Path) -> bool:
 
 
 class BagFile:
-    """A ROS bag, opened when it is first read; a copy sent to another process opens the file again.
+    """A ROS bag, opened when it is first read and closed with this object; a copy in another process opens it again.
 
     Raises:
         MitsonarError: if the bag is damaged, or its suffix is not the one that its format requires.
@@ -138,6 +139,7 @@ class BagFile:
         self._check_name()
         reader = AnyReader([self.path], default_typestore=ros1_types() if self.is_ros1 else ros2_types())
         reader.open()
+        weakref.finalize(self, reader.close)
         self._reader = reader
         return reader
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import pickle
 import sqlite3
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +136,18 @@ def test_a_reader_can_be_sent_to_another_process(tmp_path: Path) -> None:
     source = open_frames(bag(tmp_path / "a.bag"))
     again = pickle.loads(pickle.dumps(source.images))
     assert (again(np.array([2])) == source.images(np.array([2]))).all()
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_recording_that_is_gone_leaves_no_file_open(tmp_path: Path, name: str) -> None:
+    path = bag(tmp_path / name)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", ResourceWarning)
+        recording = open_recording(path)
+        recording.part().read([0])
+        del recording
+        gc.collect()
+    assert [str(one.message) for one in said] == []
 
 
 def test_a_database_by_itself_and_without_definitions(tmp_path: Path) -> None:
