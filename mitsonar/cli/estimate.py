@@ -323,8 +323,7 @@ def mosaic(
     spread = f"median standard deviation {np.median(known):.4f}" if known.size else "no cell is lit by two frames"
     say(
         f"{count_noun(ground_map.frames, 'frame')} along the {laid_along} path: {rows:,} x {columns:,} cells of "
-        f"{cell_mm:g} mm, {rows * cell_mm / 1e3:.4g} x {columns * cell_mm / 1e3:.4g} m; "
-        f"{spread}"
+        f"{cell_mm:g} mm, {rows * cell_mm / 1e3:.4g} x {columns * cell_mm / 1e3:.4g} m; {spread}"
     )
     say(f"mosaic: {out}" + (f", quality: {quality}" if quality else " (bands: mean, standard deviation, count)"))
 

@@ -32,7 +32,7 @@ from mitsonar.motion.pose import poses_from, vehicle_rotation
 from mitsonar.motion.sensors import VehicleSensors, leaning_mount, smoothed_change
 from mitsonar.motion.trajectory import Trajectory
 from mitsonar.recordings.recording import CHUNK_BYTES, Part, Pixels, Recording
-from mitsonar.records.frames import COLUMNS, LABELS, PER_FRAME, SonarFrames, check_column, open_group, to_float32
+from mitsonar.records.frames import COLUMNS, LABELS, PER_FRAME, SonarFrames, check_column, frames_in, open_group, to_float32
 
 if TYPE_CHECKING:
     from mitsonar.datasets.store import DataStore
@@ -487,9 +487,6 @@ def _heave_rate(time_s: Array, rise_m: Array, std_m: Array) -> float:
 StoredArray = Any
 """A Zarr array of either metadata format, read by indexing."""
 
-RUN_FRAMES = ("frames.npz", "frames.zarr")
-"""Files that hold the frames of a run."""
-
 FINDING = "give frames.npz, frames.zarr, the folder of a run, a data set or a recording"
 
 
@@ -519,8 +516,8 @@ def open_frames(
     if sequence is not None or view is not None:
         raise MitsonarError(f"{where} is neither a data set nor a recording: leave sequence and view out")
     if os.path.isdir(path) and not os.path.isfile(path / "zarr.json"):
-        candidates = [path / name for name in RUN_FRAMES if os.path.exists(path / name)]
-        if not candidates:
+        stored = frames_in(path)
+        if stored is None:
             from mitsonar.recordings.open import recordings_in
 
             if kind_of_run(path) == "odometry":
@@ -528,7 +525,7 @@ def open_frames(
                     f"{path} is the folder of an odometry, which holds no frames: give the run or recording of the frames"
                 )
             raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: {recordings_in(path) or FINDING}")
-        path = candidates[0]
+        path = stored
     return _open_zarr(path, str(where)) if os.path.isdir(path) else _open_npz(path, str(where))
 
 
@@ -573,7 +570,7 @@ def is_data_set(where: str | Path) -> bool:
 
 def is_recording(where: str | Path) -> bool:
     """Return whether a path is a recording of a real sonar; the readers are not loaded for a run of mitsonar."""
-    run = os.path.isfile(Path(where) / "run.json") and any(os.path.exists(Path(where) / name) for name in RUN_FRAMES)
+    run = os.path.isfile(Path(where) / "run.json") and frames_in(where) is not None
     if run or "://" in str(where):
         return False
     from mitsonar.recordings.open import detect_format
@@ -818,7 +815,7 @@ def recording_at(
 def _beam_motion_at(path: Path, frames: int) -> tuple[Array | None, Array | None]:
     """Return the times ``(frames, beams)`` and poses ``(frames, beams, 6)`` of the beams of a run, as far as it has them."""
     if os.path.isdir(path) and path.suffix != ".zarr":
-        path = next(one for one in (path / "frames.npz", path / "frames.zarr") if os.path.exists(one))
+        path = frames_in(path) or path
     if os.path.isfile(path):
         table: dict[str, Any] = SonarFrames.load(path).arrays()
     else:
@@ -833,7 +830,7 @@ def _beam_motion_at(path: Path, frames: int) -> tuple[Array | None, Array | None
 def _labels_at(path: Path) -> Callable[[Index], Labels] | None:
     """Return a function that reads the labels of a run by frame number; None if the run has no labels."""
     if os.path.isdir(path) and path.suffix != ".zarr":
-        path = next(one for one in (path / "frames.npz", path / "frames.zarr") if os.path.exists(one))
+        path = frames_in(path) or path
     if os.path.isfile(path):
         frames = SonarFrames.load(path)
         labels = {name: getattr(frames, name) for name in LABELS if getattr(frames, name) is not None}

@@ -38,6 +38,7 @@ from mitsonar.recordings.side_scan import SideScan, SideScanPart, holds_echogram
 from mitsonar.recordings.sonar_3d15 import is_range_images, read_range_images
 from mitsonar.recordings.sound_metrics import SIGNATURE, SIGNATURES, read_aris, read_didson
 from mitsonar.recordings.xtf import is_xtf, read_xtf
+from mitsonar.records.frames import frames_in
 
 __all__ = [
     "FORMATS",
@@ -172,16 +173,11 @@ def recordings_in(folder: Path) -> str:
         entries = sorted(folder.iterdir())[:MOST_TRIED] if os.path.isdir(folder) else []
     except OSError:
         return ""
-    inside = [one for one in entries if _holds_frames(one) or detect_format(one) is not None or frameless_words(one)]
+    inside = [one for one in entries if frames_in(one) is not None or detect_format(one) is not None or frameless_words(one)]
     if len(inside) < 2:
         return f"give the recording in it, {inside[0]}" if inside else ""
     more = f" and {len(inside) - MOST_NAMED:,} more" if len(inside) > MOST_NAMED else ""
     return f"give one of the recordings in it: {', '.join(one.name for one in inside[:MOST_NAMED])}{more}"
-
-
-def _holds_frames(folder: Path) -> bool:
-    """Return whether a folder is a run with frames, as each imaging sonar of a vehicle has one."""
-    return any(os.path.exists(folder / name) for name in ("frames.npz", "frames.zarr"))
 
 
 def known_formats() -> str:

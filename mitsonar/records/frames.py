@@ -45,6 +45,7 @@ __all__ = [
     "ViewFrames",
     "arrays_in",
     "check_column",
+    "frames_in",
     "max_plausible_rows",
     "number_of",
     "open_group",
@@ -573,10 +574,10 @@ class SonarFrames:
         """
         path = Path(path)
         if os.path.isdir(path) and path.suffix != ".zarr":
-            existing = [path / name for name in ("frames.npz", "frames.zarr") if os.path.exists(path / name)]
-            if not existing:
+            stored = frames_in(path)
+            if stored is None:
                 raise MitsonarError(f"{path} holds no frames.npz or frames.zarr: give the folder of a finished run")
-            path = existing[0]
+            path = stored
         if not os.path.exists(path):
             raise missing_file(path, "give frames.npz or a run's folder")
         try:
@@ -645,6 +646,12 @@ def to_uint8(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 MAX_NPZ_FRAMES = 1000
 """Largest number of frames that a run packs into one ``frames.npz``. Longer runs remain as ``frames.zarr``."""
+
+
+def frames_in(run: str | Path) -> Path | None:
+    """Return the file or group in the folder of a run that holds its frames; None if there is neither."""
+    paths = (Path(run) / name for name in ("frames.npz", "frames.zarr"))
+    return next((path for path in paths if os.path.exists(path)), None)
 
 
 class FrameStore:
